@@ -8,10 +8,10 @@ use crate::detector::Tag;
 use crate::family::{self, SIDE};
 use crate::pdf;
 
-/// Side of a tag's black square, metres: three millimetres a cell, which a camera with a thousand pixels of focal length sees with
-/// four pixels at 0.75 metres.
+/// Side of a tag's black square, metres: three millimetres per cell, which is four pixels at 0.75 metres for a camera with a focal
+/// length of a thousand pixels.
 const TAG: f64 = 0.024;
-/// White between two tags, metres: four cells.
+/// White gap between two tags, metres: four cells.
 const GAP: f64 = 0.012;
 /// Length of the printed ruler, metres.
 pub(crate) const RULER: f64 = 0.1;
@@ -29,7 +29,7 @@ pub enum Paper {
 }
 
 impl Paper {
-    /// All of them.
+    /// All sizes.
     pub const ALL: [Paper; 3] = [Paper::A4, Paper::A3, Paper::Letter];
 
     /// Width and height, metres.
@@ -74,7 +74,7 @@ impl std::fmt::Display for Paper {
     }
 }
 
-/// What is printed on a sheet, metres from its top left corner.
+/// The print on a sheet, metres from its top left corner.
 pub(crate) struct Print {
     /// Black rectangles: left, top, width, height.
     pub black: Vec<[f64; 4]>,
@@ -95,9 +95,9 @@ pub(crate) struct Text {
 pub struct Corner {
     /// Number of the tag.
     pub tag: usize,
-    /// Where it is on the board, metres.
+    /// Its position on the board, metres.
     pub on_board: Vec3,
-    /// Where the image shows it, pixels as stored (lens distortion included).
+    /// Its position in the image, pixels as stored (lens distortion included).
     pub pixel: Vec2,
     /// Width of the edges that meet there, pixels.
     pub edge_width: f64,
@@ -105,7 +105,7 @@ pub struct Corner {
     pub side: f64,
 }
 
-/// A sheet with a grid of tags. Sheets of different paper have different tags, so that a photograph tells which one it shows.
+/// A sheet with a grid of tags. Sheets of different paper sizes have different tags, so that a photograph identifies its sheet.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Board {
     paper: Paper,
@@ -113,21 +113,22 @@ pub struct Board {
 }
 
 impl Board {
-    /// The board for a size of paper, printed in its true size.
+    /// The board for a size of paper, printed at its true size.
     pub fn new(paper: Paper) -> Board {
         Board { paper, scale: 1.0 }
     }
 
-    /// The same, printed so that its ruler of 100 mm measures `ruler` metres; `None` unless that is 10 mm to 1 m.
+    /// The same board printed at another scale, so that its ruler of 100 mm measures `ruler` metres; `None` unless that is between
+    /// 10 mm and 1 m.
     pub fn with_ruler(self, ruler: f64) -> Option<Board> {
         (0.01..=1.0).contains(&ruler).then_some(Board { scale: ruler / RULER, ..self })
     }
 
-    /// The board whose tags these are: the one with most of them; `None` where there is none.
+    /// The board to which these tags belong: the one with most of them; `None` if there is none.
     pub fn of_tags(tags: &[Tag]) -> Option<Board> {
         let count = |board: &Board| tags.iter().filter(|tag| board.place(tag.id).is_some()).count();
         let boards = Paper::ALL.map(Board::new);
-        // The first of equals.
+        // The first one of several with equal numbers.
         boards.into_iter().rev().max_by_key(count).filter(|board| count(board) > 0)
     }
 
@@ -142,7 +143,7 @@ impl Board {
         columns * rows
     }
 
-    /// Whether there is no tag; there always is.
+    /// Always false: a board has tags.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
@@ -168,7 +169,8 @@ impl Board {
         Some(corners.map(|(x, y)| Vec3::new(x, y, 0.0) * self.scale))
     }
 
-    /// The corners of found tags that are on this board. A tag that was found twice is left out: nobody knows which is the board's.
+    /// The corners of found tags that are on this board. A tag that was found twice is left out, because it is unknown which of the
+    /// two is the board's.
     pub fn corners(&self, tags: &[Tag]) -> Vec<Corner> {
         let of_tag = |tag: &Tag| {
             let places = self.tag_corners(tag.id)?;
@@ -186,7 +188,8 @@ impl Board {
         tags.iter().filter(once).filter_map(of_tag).flatten().collect()
     }
 
-    /// How bright the sheet is at a place of the board's frame, metres; `None` off the sheet. The ruler and its text are left out.
+    /// Whether the sheet is white at a point of the board's frame, metres; `None` outside the sheet. The ruler and its text are
+    /// ignored.
     pub fn is_white(&self, x: f64, y: f64) -> Option<bool> {
         let (x, y) = (x / self.scale, y / self.scale);
         let (width, height) = self.paper.size();
@@ -211,7 +214,7 @@ impl Board {
         Some(family::cells(first + row as usize * columns + column as usize)[i - 1][j - 1])
     }
 
-    /// The sheet in the board's frame: its left and lowest, and its right and highest coordinates, metres.
+    /// The extent of the sheet in the board's frame: smallest and largest coordinates, metres.
     pub fn extent(&self) -> [Vec2; 2] {
         let (width, height) = self.paper.size();
         let centre = Vec2::new(0.0, -self.middle_below_sheets());
@@ -219,12 +222,12 @@ impl Board {
         [(centre - half) * self.scale, (centre + half) * self.scale]
     }
 
-    /// How far the middle of the tags is above the middle of the sheet, metres: the ruler is below the tags.
+    /// How far the centre of the tags is above the centre of the sheet, metres: the ruler is below the tags.
     pub(crate) fn middle_below_sheets(&self) -> f64 {
         0.008
     }
 
-    /// What is printed.
+    /// The print of the sheet.
     pub(crate) fn print(&self) -> Print {
         let (width, height) = self.paper.size();
         let (columns, rows, first) = self.paper.tags();
@@ -242,7 +245,7 @@ impl Board {
                 [left + edge, top + cell, cell, TAG - 2.0 * cell],
             ]);
             for (i, row) in family::cells(id).iter().enumerate() {
-                // Neighbours in one rectangle: viewers leave hairlines between two.
+                // Neighbouring cells are merged into one rectangle, because viewers show hairlines between two.
                 let mut j = 0;
                 while j < row.len() {
                     let run = row[j..].iter().take_while(|white| !**white).count();
@@ -273,12 +276,12 @@ impl Board {
         Print { black, text }
     }
 
-    /// The sheet as a PDF file of one page, in its true size.
+    /// The sheet as a PDF file of one page, at its true size.
     pub fn pdf(&self) -> Vec<u8> {
         pdf::page(self.paper.size(), &self.print())
     }
 
-    /// The sheet as an image with `dots` pixels a millimetre.
+    /// The sheet as an image with `dots` pixels per millimetre.
     pub fn image(&self, dots: f64) -> RgbImage {
         let (width, height) = self.paper.size();
         let pixels = |metres: f64| (metres * 1000.0 * dots).round().max(1.0) as usize;

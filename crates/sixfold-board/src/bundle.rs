@@ -1,5 +1,5 @@
-//! Reprojection errors of corners made small: poses of the board, and the camera beside them (Zhang 2000), by damped Gauss-Newton
-//! steps (Levenberg 1944, Marquardt 1963) with Huber's weights.
+//! Minimisation of the reprojection errors of corners over the board's poses and, optionally, the camera (Zhang 2000), by damped
+//! Gauss-Newton steps (Levenberg 1944, Marquardt 1963) with Huber's weights.
 
 use sixfold_geometry::nalgebra::{DMatrix, DVector, Vector6};
 use sixfold_geometry::{BrownConrady, Camera, Pose, Vec2};
@@ -8,24 +8,24 @@ use crate::board::Corner;
 
 /// Numbers of a camera: `fx fy cx cy k1 k2 p1 p2 k3`.
 pub(crate) const INTRINSICS: usize = 9;
-/// A residual beyond so many robust standard deviations counts in proportion to its length, no longer to its square.
+/// A residual beyond this many robust standard deviations counts in proportion to its length instead of its square.
 const HUBER: f64 = 2.5;
 const ITERATIONS: usize = 60;
 
-/// What is sought.
+/// The unknowns.
 #[derive(Debug, Clone)]
 pub(crate) struct Unknowns {
     pub camera: [f64; INTRINSICS],
     pub camera_from_board: Vec<Pose>,
 }
 
-/// What was found.
+/// The solution.
 #[derive(Debug, Clone)]
 pub(crate) struct Solution {
     pub unknowns: Unknowns,
-    /// Distances of the corners of every view from where they should be, pixels.
+    /// Residuals of the corners of every view, pixels.
     pub residuals: Vec<Vec<Vec2>>,
-    /// Standard deviations of the numbers of the camera; zero for those that are held.
+    /// Standard deviations of the numbers of the camera; zero for fixed ones.
     pub deviations: [f64; INTRINSICS],
 }
 
@@ -40,7 +40,7 @@ pub(crate) fn camera_of(n: &[f64; INTRINSICS], (width, height): (usize, usize)) 
     Camera { fx: n[0], fy: n[1], cx: n[2], cy: n[3], width, height, distortion }
 }
 
-/// Where the image shows a corner; `None` behind the camera.
+/// The projection of a corner; `None` behind the camera.
 fn projected(n: &[f64; INTRINSICS], camera_from_board: &Pose, corner: &Corner) -> Option<Vec2> {
     let p = camera_from_board.transform_point(&corner.on_board);
     if !(p.z > 1e-6) {
@@ -67,7 +67,7 @@ fn residuals(unknowns: &Unknowns, views: &[Vec<Corner>]) -> Option<Vec<Vec<Vec2>
     unknowns.camera_from_board.iter().zip(views).map(of_view).collect()
 }
 
-/// 1.4826 times the median length: the standard deviation along one axis, whatever outliers do, at least 0.02 pixels.
+/// 1.4826 times the median length: the standard deviation along one axis, robust to outliers, at least 0.02 pixels.
 fn robust_deviation(residuals: &[Vec<Vec2>]) -> f64 {
     let mut lengths: Vec<f64> = residuals.iter().flatten().flat_map(|r| [r.x.abs(), r.y.abs()]).collect();
     lengths.sort_by(f64::total_cmp);
@@ -88,7 +88,7 @@ fn cost(residuals: &[Vec<Vec2>], deviation: f64) -> f64 {
     residuals.iter().flatten().map(of).sum()
 }
 
-/// The unknowns with the least cost near a start, where only the numbers `free` of the camera may change.
+/// The unknowns with the minimum cost near a start; of the camera, only the parameters `free` may change.
 pub(crate) fn solve(start: Unknowns, views: &[Vec<Corner>], free: &[usize]) -> Option<Solution> {
     let mut unknowns = start;
     let mut now = residuals(&unknowns, views)?;

@@ -8,17 +8,17 @@ use crate::bundle::{INTRINSICS, Solution, Unknowns, camera_of, numbers_of, solve
 use crate::error::BoardError;
 use crate::pose::{allowed_misfit, check_corners, initial_pose, root_mean_square};
 
-/// Fewest photographs that determine a camera with its lens.
+/// Minimum number of photographs for a camera with lens distortion.
 const FEWEST: usize = 4;
-/// The focal length has to be known to this fraction.
+/// Largest standard deviation of the focal length, as a fraction of it.
 const KNOWN: f64 = 0.02;
 
-/// What is estimated.
+/// Which parameters are estimated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct CalibrationOptions {
-    /// Lens distortion `k1 k2 p1 p2`; without, a pinhole camera.
+    /// Whether lens distortion `k1 k2 p1 p2` is estimated; otherwise the camera is a pinhole.
     pub distortion: bool,
-    /// Also `k3`, for wide lenses.
+    /// Whether `k3` is estimated too, for wide lenses.
     pub third_radial: bool,
 }
 
@@ -33,9 +33,9 @@ impl Default for CalibrationOptions {
 pub struct View {
     /// Takes points of the board to the camera's frame.
     pub camera_from_board: Pose,
-    /// For each corner, how far from it the board is seen, pixels.
+    /// The residual of each corner: its difference to the projected corner of the board, pixels.
     pub residuals: Vec<Vec2>,
-    /// Root of the mean of their squares, pixels.
+    /// Root mean square of the residuals, pixels.
     pub rms: f64,
 }
 
@@ -44,11 +44,11 @@ pub struct View {
 pub struct Calibration {
     /// The camera, with its distortion.
     pub camera: Camera,
-    /// Standard deviations of `fx fy cx cy` in pixels and `k1 k2 p1 p2 k3`; zero for what was not estimated.
+    /// Standard deviations of `fx fy cx cy` in pixels and `k1 k2 p1 p2 k3`; zero for parameters that were not estimated.
     pub deviations: [f64; INTRINSICS],
-    /// For every photograph, the board in it, or why it was not used.
+    /// For every photograph, the board's pose in it, or why it was not used.
     pub views: Vec<Result<View, BoardError>>,
-    /// Root of the mean squared residual over the photographs that were used, pixels.
+    /// Root mean square residual over the used photographs, pixels.
     pub rms: f64,
 }
 
@@ -66,7 +66,7 @@ pub fn calibrate(
 ) -> Result<Calibration, BoardError> {
     let mut states: Vec<Result<(), BoardError>> = photographs.iter().map(|p| check_corners(p)).collect();
     let mut solution = None;
-    // Once more after a photograph that does not fit has been left out.
+    // Repeat after a photograph that does not fit was left out.
     for _ in 0..3 {
         let used: Vec<usize> = (0..states.len()).filter(|i| states[*i].is_ok()).collect();
         if used.len() < FEWEST {
@@ -128,7 +128,7 @@ fn of_views(
     let poses = views.iter().map(|v| initial_pose(v, &start)).collect::<Option<Vec<_>>>();
     let mut unknowns =
         Unknowns { camera: numbers_of(&start), camera_from_board: poses.ok_or(BoardError::NoSolution)? };
-    // The pinhole first: a lens fitted to rough poses may fold over.
+    // First only the pinhole parameters: a distortion fitted to rough poses may not be invertible.
     let mut stages: Vec<&[usize]> = vec![&[0, 1], &[0, 1, 2, 3]];
     if options.distortion {
         stages.push(&[0, 1, 2, 3, 4]);
@@ -147,15 +147,15 @@ fn of_views(
     found.ok_or(BoardError::NoSolution)
 }
 
-/// The focal length for which the board's axes are at right angles and of one length in every photograph, with the principal point
-/// in the middle (Zhang 2000, section 3.1); `None` where all are seen head-on.
+/// The focal length for which the board's axes are perpendicular and of equal length in every photograph, with the principal point
+/// at the centre (Zhang 2000, section 3.1); `None` if all views are frontal.
 fn initial_focal(views: &[Vec<Corner>], width: usize, height: usize) -> Option<f64> {
     let middle = Vec2::new(0.5 * (width as f64 - 1.0), 0.5 * (height as f64 - 1.0));
     let (mut numerator, mut denominator) = (0.0, 0.0);
     for view in views {
         let pairs: Vec<_> = view.iter().map(|c| (c.on_board.xy(), c.pixel - middle)).collect();
         let Some(h) = homography(&pairs) else { continue };
-        // In units of the image, for numbers of one size.
+        // In units of the image's size, for numbers of similar magnitude.
         let s = 1.0 / width.max(height) as f64;
         let (a, b) = (h.column(0), h.column(1));
         let scale = (a.xy().norm_squared() + b.xy().norm_squared()) * s * s;

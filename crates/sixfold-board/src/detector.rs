@@ -1,5 +1,5 @@
-//! Tags in an image: dark regions by a local threshold, quadrangles around them, corners at the edges, codes (after Olson 2011 and
-//! Wang and Olson 2016).
+//! Detection of tags in an image: dark regions by a local threshold, quadrangles around them, corners refined at the edges, then
+//! codes (following Olson 2011, and Wang and Olson 2016).
 
 use rayon::prelude::*;
 use sixfold_geometry::homography::{apply, homography};
@@ -8,9 +8,9 @@ use sixfold_geometry::{Image, Mat3, RgbImage, Vec2};
 use crate::family::{CELLS, Cells, SIDE, decode, mirrored};
 use crate::quad::{Quad, around, brightness, convex_hull, refined};
 
-/// Fewest grey levels between black and white around a pixel that is called either.
+/// Minimum difference of grey levels around a pixel that is classified as black or white.
 const CONTRAST: u8 = 24;
-/// Fewest pixels of a dark region that may be a tag's border.
+/// Minimum number of pixels of a dark region that can be a tag's border.
 const FEWEST_PIXELS: usize = 40;
 
 /// A tag in an image.
@@ -20,7 +20,8 @@ pub struct Tag {
     pub id: usize,
     /// Corners of its black square in pixels: top left, top right, bottom right, bottom left of the upright tag.
     pub corners: [Vec2; 4],
-    /// Width of its two widest edges, pixels: brightness changes from black to white over so many, 1 to 3 in a sharp image.
+    /// Width of its two widest edges, pixels: the distance over which brightness changes from black to white, 1 to 3 in a sharp
+    /// image.
     pub edge_width: f64,
 }
 
@@ -31,16 +32,16 @@ impl Tag {
     }
 }
 
-/// What an image shows of tags.
+/// The tags in an image.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Detections {
-    /// The tags, by number, then from left to right. A number may be seen several times.
+    /// The tags, by number, then from left to right. A number may occur several times.
     pub tags: Vec<Tag>,
-    /// How many tags are seen in a mirror.
+    /// Number of mirrored tags.
     pub mirrored: usize,
 }
 
-/// The tags in an image. Pixel centres at whole numbers; corners are where the image shows them, lens distortion included.
+/// The tags in an image. Pixel centres at whole numbers; corners are in the stored image, lens distortion included.
 pub fn detect_tags(image: &RgbImage) -> Detections {
     let grey =
         image.map(|[r, g, b]| ((77 * u32::from(*r) + 150 * u32::from(*g) + 29 * u32::from(*b)) >> 8) as u8);
@@ -58,10 +59,10 @@ pub fn detect_tags(image: &RgbImage) -> Detections {
     found
 }
 
-/// The tag around which these points lie: `Some(None)` for one in a mirror.
+/// The tag whose border consists of these points: `Some(None)` for a mirrored one.
 fn read_tag(grey: &Image<u8>, points: &mut Vec<(i32, i32)>) -> Option<Option<Tag>> {
     let quad = around(&convex_hull(points))?;
-    // Cheap first: most dark regions are no tags.
+    // A cheap test first: most dark regions are not tags.
     read_cells(grey, &quad, 0.2)?;
     let (quad, slope) = refined(grey, &quad)?;
     let (cells, contrast) = read_cells(grey, &quad, 0.4)?;
@@ -74,8 +75,8 @@ fn read_tag(grey: &Image<u8>, points: &mut Vec<(i32, i32)>) -> Option<Option<Tag
     }
 }
 
-/// The cells inside a quadrangle; `None` where its border is not dark and its surroundings bright, by `clear` of the contrast
-/// between the two. With them the contrast, grey levels.
+/// The cells inside a quadrangle, and the contrast in grey levels. `None` unless its border is dark and its surroundings are
+/// bright by at least the fraction `clear` of the contrast.
 fn read_cells(grey: &Image<u8>, quad: &Quad, clear: f64) -> Option<(Cells, f64)> {
     let side = SIDE as f64;
     let square = [(0.0, 0.0), (side, 0.0), (side, side), (0.0, side)].map(|(x, y)| Vec2::new(x, y));
@@ -93,7 +94,7 @@ fn read_cells(grey: &Image<u8>, quad: &Quad, clear: f64) -> Option<(Cells, f64)>
             }
         }
     }
-    // Where the tag's surroundings are cut off by the image's border, half of them will do.
+    // If the image's border cuts off the tag's surroundings, half of them are enough.
     if white.len() < 2 * SIDE || black.len() < 4 * SIDE {
         return None;
     }
@@ -119,7 +120,7 @@ fn read_cells(grey: &Image<u8>, quad: &Quad, clear: f64) -> Option<(Cells, f64)>
     Some((cells, contrast))
 }
 
-/// Mean brightness in the middle of a cell, with the cell's centre.
+/// Mean brightness at the centre of a cell, with the cell's centre.
 fn level(grey: &Image<u8>, image_from_tag: &Mat3, column: i32, row: i32) -> Option<(f64, f64, f64)> {
     let (u, v) = (f64::from(column) + 0.5, f64::from(row) + 0.5);
     let mut sum = 0.0;
@@ -129,7 +130,7 @@ fn level(grey: &Image<u8>, image_from_tag: &Mat3, column: i32, row: i32) -> Opti
     Some((u, v, sum / 5.0))
 }
 
-/// Brightness that changes evenly over a tag: light falls in from one side.
+/// Brightness that changes linearly over a tag, for light from one side.
 struct Gradient {
     mean: f64,
     middle: (f64, f64),
@@ -160,7 +161,7 @@ impl Gradient {
     }
 }
 
-/// Pixels that are darker than the middle between the darkest and brightest around them, where these differ.
+/// Pixels that are darker than the mean of the darkest and the brightest pixel around them, where these differ enough.
 fn dark_pixels(grey: &Image<u8>) -> Image<bool> {
     let (width, height) = grey.size();
     let tile = (width.min(height) / 160).clamp(4, 32);
@@ -234,7 +235,7 @@ fn dark_regions(grey: &Image<u8>) -> Vec<Vec<(i32, i32)>> {
     regions
 }
 
-/// The first and last pixel of every row: the hull of a region has no others for corners.
+/// The first and last pixel of every row: only these can be corners of a region's hull.
 fn outermost(region: &mut [(i32, i32)]) -> Vec<(i32, i32)> {
     region.sort_unstable_by_key(|(x, y)| (*y, *x));
     let mut ends = vec![];

@@ -6,7 +6,7 @@ use thiserror::Error;
 #[derive(Debug, Error, Clone, PartialEq)]
 #[non_exhaustive]
 pub enum BoardError {
-    /// Too little of the board is in sight.
+    /// Too little of the board is visible.
     #[error(
         "found {found} tags of the board, expected at least {least}: show more of the board, sharp and well lit"
     )]
@@ -32,13 +32,13 @@ pub enum BoardError {
         /// What is allowed for tags of this size.
         most: f64,
     },
-    /// Corners are not where any pose of the board would put them.
+    /// The corners fit no pose of the board.
     #[error(
         "corners are {found:.1} pixels from where the board would have them, expected at most {most:.1}: is the board flat, and \
          the camera file that of this photograph?"
     )]
     DoesNotFit {
-        /// Root of the mean squared distance, pixels.
+        /// Root mean square distance, pixels.
         found: f64,
         /// What is allowed.
         most: f64,

@@ -1,12 +1,12 @@
-//! The tag family 36h11: 587 codes of 6 x 6 cells, any two at least 11 cells apart however rotated (Olson 2011).
+//! The tag family 36h11: 587 codes of 6 x 6 cells, any two differing in at least 11 cells in any rotation (Olson 2011).
 
 use std::sync::OnceLock;
 
 /// Cells along a side of a code.
 pub(crate) const CELLS: usize = 6;
-/// Cells along a side of a tag's black square: the code and one of border on either side.
+/// Cells along a side of a tag's black square: the code and one border cell on each side.
 pub(crate) const SIDE: usize = CELLS + 2;
-/// So many cells read wrongly are repaired. With 5 (the most that is unambiguous) clutter is taken for tags now and then.
+/// Maximum number of wrong cells that are corrected. With 5 (the unambiguous maximum) clutter is sometimes detected as a tag.
 const REPAIRED: u32 = 2;
 
 /// Cells of a code, row by row from the top left; `true` is white.
@@ -30,8 +30,8 @@ fn code_of(cells: &Cells) -> u64 {
     cells.iter().flatten().fold(0, |code, &white| code << 1 | u64::from(white))
 }
 
-/// Which tag some cells are, and by how many corners it is rotated: the tag's top left corner is the read square's corner of that
-/// number, clockwise.
+/// The tag with these cells, and the number of corners by which it is rotated: the tag's top left corner is the read square's
+/// corner of that number, clockwise.
 pub(crate) fn decode(read: &Cells) -> Option<(usize, usize)> {
     let mut cells = *read;
     let mut best: Option<(u32, usize, usize)> = None;
@@ -49,7 +49,7 @@ pub(crate) fn decode(read: &Cells) -> Option<(usize, usize)> {
     best.map(|(_, id, rotation)| (id, rotation))
 }
 
-/// The same cells seen in a mirror.
+/// The mirrored cells.
 pub(crate) fn mirrored(cells: &Cells) -> Cells {
     cells.map(|mut row| {
         row.reverse();
@@ -83,7 +83,7 @@ mod tests {
     #[test]
     fn a_rotated_tag_with_two_wrong_cells_is_repaired_and_one_with_three_is_not() {
         let upright = cells(17);
-        // The tag's top left corner is at the top right of what is read.
+        // The tag's top left corner is at the top right of the read cells.
         let mut read: Cells = std::array::from_fn(|r| std::array::from_fn(|c| upright[CELLS - 1 - c][r]));
         assert_eq!(decode(&read), Some((17, 1)));
         read[0][0] ^= true;

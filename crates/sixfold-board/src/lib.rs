@@ -1,9 +1,9 @@
-//! A board of AprilTags (Olson 2011): a sheet to print, its tags found in photographs, cameras calibrated with it.
+//! A board of AprilTags (Olson 2011): the sheet to print, detection of its tags in photographs, and camera calibration.
 //!
-//! An object stands on the printed [`Board`] and is photographed from all sides. [`detect_tags`] finds the tags that are in sight,
-//! [`calibrate`] the camera from several photographs, [`board_pose`] the camera's pose in each.
+//! An object stands on the printed [`Board`] and is photographed from all sides. [`detect_tags`] finds the visible tags,
+//! [`calibrate`] the camera from several photographs, and [`board_pose`] the camera's pose in each.
 //!
-//! The board's frame: origin in the middle of the tags, x to the right, y up the sheet, z out of it; metres.
+//! The board's frame: origin at the centre of the tags, x to the right, y up the sheet, z out of it; metres.
 //!
 //! ```
 //! use sixfold_board::{Board, Paper, board_pose, detect_tags, simulation};

@@ -4,7 +4,7 @@ use std::fmt::Write;
 
 use crate::board::{Print, Text};
 
-/// Points in a metre.
+/// Points per metre.
 const POINTS: f64 = 72.0 / 0.0254;
 
 /// A page of a size in metres.

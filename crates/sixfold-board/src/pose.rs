@@ -8,13 +8,13 @@ use crate::board::Corner;
 use crate::bundle::{Unknowns, numbers_of, solve};
 use crate::error::BoardError;
 
-/// Fewest tags of a photograph that is used: with one or two the board may lean either way.
+/// Minimum number of tags in a usable photograph: with one or two, the board's tilt is ambiguous.
 pub(crate) const FEWEST_TAGS: usize = 4;
-/// Widest edges of tags, as a fraction of a tag's side: one cell, beyond which neighbours run into each other.
+/// Largest edge width, as a fraction of a tag's side: one cell; with wider edges neighbouring cells merge.
 const WIDEST_EDGE: f64 = 1.0 / 8.0;
-/// Edges of fewer pixels are never blurred.
+/// Edges narrower than this many pixels never count as blurred.
 const SHARP: f64 = 4.0;
-/// Most that corners may be from where the board has them, as a fraction of a tag's side, and in pixels.
+/// Largest distance of corners from the projected board, as a fraction of a tag's side, and in pixels.
 const MISFIT: (f64, f64) = (0.02, 1.0);
 
 /// The board in a photograph.
@@ -22,13 +22,14 @@ const MISFIT: (f64, f64) = (0.02, 1.0);
 pub struct BoardPose {
     /// Takes points of the board to the camera's frame.
     pub camera_from_board: Pose,
-    /// For each corner, how far from it the board is seen, pixels.
+    /// The residual of each corner: its difference to the projected corner of the board, pixels.
     pub residuals: Vec<Vec2>,
-    /// Root of the mean of their squares, pixels.
+    /// Root mean square of the residuals, pixels.
     pub rms: f64,
 }
 
-/// The board's pose in a photograph by a known camera, from corners as stored (lens distortion included).
+/// The board's pose in a photograph of a known camera, from corners in stored pixels (lens distortion
+/// included).
 ///
 /// # Errors
 /// [`BoardError::TooFewTags`], [`BoardError::Blurred`], [`BoardError::DoesNotFit`].
@@ -57,7 +58,7 @@ pub fn board_pose(corners: &[Corner], camera: &Camera) -> Result<BoardPose, Boar
     Ok(found)
 }
 
-/// An error where corners are too few or too blurred.
+/// An error if corners are too few or too blurred.
 pub(crate) fn check_corners(corners: &[Corner]) -> Result<(), BoardError> {
     if corners.len() < 4 * FEWEST_TAGS {
         return Err(BoardError::TooFewTags { found: corners.len() / 4, least: FEWEST_TAGS });
@@ -70,7 +71,7 @@ pub(crate) fn check_corners(corners: &[Corner]) -> Result<(), BoardError> {
     Ok(())
 }
 
-/// How far corners may be off, pixels.
+/// Largest allowed distance of corners from the projected board, pixels.
 pub(crate) fn allowed_misfit(corners: &[Corner]) -> f64 {
     (MISFIT.0 * median(corners.iter().map(|c| c.side))).max(MISFIT.1)
 }
@@ -85,7 +86,7 @@ fn median(values: impl Iterator<Item = f64>) -> f64 {
     values.get(values.len() / 2).copied().unwrap_or(0.0)
 }
 
-/// The pose that the map from the board to the image holds (Zhang 2000, section 3.1).
+/// The pose from the homography between board and image (Zhang 2000, section 3.1).
 pub(crate) fn initial_pose(corners: &[Corner], camera: &Camera) -> Option<Pose> {
     let normalised = |pixel: &Vec2| {
         let p = camera.undistort_point(pixel)?;
@@ -112,7 +113,8 @@ fn pose_of(map: &Mat3) -> Option<Pose> {
     })
 }
 
-/// A flat thing seen from afar looks nearly the same when it leans the other way (Schweighofer and Pinz 2006).
+/// The ambiguous second pose: a distant flat object looks nearly the same when tilted the other way
+/// (Schweighofer and Pinz 2006).
 fn leaning_the_other_way(pose: &Pose) -> Pose {
     let Some(sight) = pose.translation().try_normalize(1e-12) else { return *pose };
     let normal = pose.transform_direction(&Vec3::z());

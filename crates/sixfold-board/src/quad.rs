@@ -1,8 +1,8 @@
-//! Quadrangles around dark regions, and their corners to a fraction of a pixel.
+//! Quadrangles around dark regions, and their corners with subpixel accuracy.
 
 use sixfold_geometry::{Image, Vec2};
 
-/// Shortest side of a tag, pixels: less than a pixel and a half a cell cannot be read.
+/// Shortest side of a tag, pixels: fewer than one and a half pixels per cell cannot be read.
 const SHORTEST: f64 = 11.0;
 /// The quadrangle may be larger than the convex hull by this fraction: corners are rounded by blur.
 const ADDED_AREA: f64 = 0.25;
@@ -47,8 +47,8 @@ fn intersection(a: Vec2, along_a: Vec2, b: Vec2, along_b: Vec2) -> Option<Vec2> 
     (det.abs() > 1e-3 * scale).then(|| a + along_a * (cross(b - a, along_b) / det))
 }
 
-/// The quadrangle around a convex polygon that is left when sides are taken away one by one, each time the one whose neighbours
-/// meet with the least area added; `None` where that is no tag's shape.
+/// The quadrangle around a convex polygon: sides are removed one by one, each time the side whose removal adds the least area;
+/// `None` if the result does not have the shape of a tag.
 pub(crate) fn around(hull: &[Vec2]) -> Option<Quad> {
     let mut polygon = hull.to_vec();
     let before = area(&polygon);
@@ -59,11 +59,11 @@ pub(crate) fn around(hull: &[Vec2]) -> Option<Quad> {
         let n = polygon.len();
         let mut best: Option<(f64, usize, Vec2)> = None;
         for i in 0..n {
-            // The side from i to i + 1 goes; the one before and the one after are extended until they meet.
+            // The side from i to i + 1 is removed; the sides before and after it are extended until they meet.
             let (a, b, c, d) =
                 (polygon[(i + n - 1) % n], polygon[i], polygon[(i + 1) % n], polygon[(i + 2) % n]);
             let Some(meet) = intersection(b, b - a, c, c - d) else { continue };
-            // Beyond both of them, else the sides diverge.
+            // The intersection has to be beyond both ends; otherwise the sides diverge.
             if (meet - b).dot(&(b - a)) < 0.0 || (meet - c).dot(&(c - d)) < 0.0 {
                 continue;
             }
@@ -86,7 +86,7 @@ fn is_tag_shaped(quad: &Quad) -> bool {
         && (0..4).all(|i| side(i).norm() < 8.0 * side((i + 1) % 4).norm())
 }
 
-/// Brightness between pixels; `None` outside the image.
+/// Interpolated brightness; `None` outside the image.
 pub(crate) fn brightness(image: &Image<u8>, p: &Vec2) -> Option<f64> {
     let (x, y) = (p.x.floor(), p.y.floor());
     if !(x >= 0.0 && y >= 0.0 && x + 1.0 < image.width() as f64 && y + 1.0 < image.height() as f64) {
@@ -99,7 +99,8 @@ pub(crate) fn brightness(image: &Image<u8>, p: &Vec2) -> Option<f64> {
     Some(upper * (1.0 - v) + lower * v)
 }
 
-/// A line along an edge from bright (outside) to dark: a point, a direction, and how steep the edge is, grey levels a pixel.
+/// A line along an edge from bright (outside) to dark: a point, a direction, and the steepness of the edge in grey levels per
+/// pixel.
 fn edge(image: &Image<u8>, from: Vec2, to: Vec2, outside: Vec2, reach: f64) -> Option<(Vec2, Vec2, f64)> {
     let length = (to - from).norm();
     let samples = (length.round() as usize).clamp(12, 160);
@@ -107,7 +108,7 @@ fn edge(image: &Image<u8>, from: Vec2, to: Vec2, outside: Vec2, reach: f64) -> O
     let mut points = vec![];
     let mut slopes = vec![];
     for k in 0..samples {
-        // Not near the corners, which are rounded.
+        // Avoid the corners, which are rounded.
         let along = 0.12 + 0.76 * (k as f64 + 0.5) / samples as f64;
         let base = from + (to - from) * along;
         let profile = |offset: f64| brightness(image, &(base + outside * offset));
@@ -132,7 +133,7 @@ fn edge(image: &Image<u8>, from: Vec2, to: Vec2, outside: Vec2, reach: f64) -> O
     Some((point, along, slopes[slopes.len() / 2]))
 }
 
-/// The line through at least `least` points; those that lie off it are left out.
+/// The line fitted to at least `least` points; outliers are left out.
 fn fitted_line(points: &[Vec2], least: usize) -> Option<(Vec2, Vec2)> {
     let mut kept: Vec<Vec2> = points.to_vec();
     let mut line = None;
@@ -160,8 +161,8 @@ fn fitted_line(points: &[Vec2], least: usize) -> Option<(Vec2, Vec2)> {
     line
 }
 
-/// The corners where lines along the quadrangle's edges meet, and how steep the two flattest edges are, grey levels a pixel: motion
-/// blurs the edges across it only. `None` where there are no edges from bright outside to dark inside.
+/// The intersections of the lines along the quadrangle's edges, and the steepness of the two flattest edges in grey levels per
+/// pixel (motion blurs only the edges across it). `None` if there are no edges from bright outside to dark inside.
 pub(crate) fn refined(image: &Image<u8>, quad: &Quad) -> Option<(Quad, f64)> {
     let mut quad = *quad;
     let mut slope = 0.0;
@@ -171,7 +172,7 @@ pub(crate) fn refined(image: &Image<u8>, quad: &Quad) -> Option<(Quad, f64)> {
         for i in 0..4 {
             let (from, to) = (quad[i], quad[(i + 1) % 4]);
             let along = (to - from).try_normalize(1e-9)?;
-            // Clockwise with y down: inside is to the right of the way, outside to the left.
+            // Clockwise with y down: the inside is to the right of the direction, the outside to the left.
             let outside = Vec2::new(along.y, -along.x);
             let side = (to - from).norm();
             let reach =
@@ -184,7 +185,7 @@ pub(crate) fn refined(image: &Image<u8>, quad: &Quad) -> Option<(Quad, f64)> {
         for i in 0..4 {
             let ((a, along_a), (b, along_b)) = (lines[(i + 3) % 4], lines[i]);
             next[i] = intersection(a, along_a, b, along_b)?;
-            // A corner that runs away follows another edge.
+            // A corner that moves far away has followed another edge.
             let side = (quad[(i + 1) % 4] - quad[i]).norm();
             if (next[i] - quad[i]).norm() > 0.15 * side + 2.0 {
                 return None;

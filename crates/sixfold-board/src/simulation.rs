@@ -1,4 +1,4 @@
-//! Simulated photographs of a board, with exact truth: for tests and for trying a camera before it is bought.
+//! Simulated photographs of a board with exact ground truth: for tests, and to try a camera before buying it.
 
 use rayon::prelude::*;
 use sixfold_geometry::random::{normal, stream};
@@ -6,7 +6,7 @@ use sixfold_geometry::{Camera, Image, Pose, RgbImage, Vec2, Vec3};
 
 use crate::board::Board;
 
-/// What makes a photograph worse than a drawing.
+/// The degradations of a photograph.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Conditions {
     /// Standard deviation of blur, pixels.
@@ -28,7 +28,7 @@ impl Default for Conditions {
 /// Samples along a side of a pixel.
 const SAMPLES: usize = 4;
 
-/// A photograph of a board by a camera (with its distortion) at a pose. Same seed, same image.
+/// A photograph of a board by a camera (with its distortion) at a pose. The same seed gives the same image.
 pub fn photograph(
     board: &Board,
     camera: &Camera,
@@ -62,7 +62,8 @@ pub fn photograph(
     })
 }
 
-/// What fraction of light a pixel's ray finds reflected: white paper 1, ink 0.1, the table 0.4, what hides tags 0.25.
+/// The fraction of light that is reflected along a pixel's ray: white paper 1, ink 0.1, the table 0.4, occluders
+/// 0.25.
 fn reflectance(
     board: &Board,
     camera: &Camera,

@@ -1,4 +1,4 @@
-//! Simulated photographs of the board: tags, poses and calibrations against the truth.
+//! Simulated photographs of the board: tags, poses and calibrations compared with the ground truth.
 
 use sixfold_board::simulation::{Conditions, photograph};
 use sixfold_board::{
@@ -40,7 +40,7 @@ fn corners(image: &RgbImage) -> Vec<Corner> {
     Board::new(Paper::A4).corners(&detect_tags(image).tags)
 }
 
-/// How far found corners are from the truth, pixels, shortest first.
+/// Errors of the found corners, pixels, smallest first.
 fn errors(corners: &[Corner], camera: &Camera, pose: &Pose) -> Vec<f64> {
     let error = |c: &Corner| {
         let p = camera.project(&pose.transform_point(&c.on_board)).unwrap();
@@ -84,7 +84,7 @@ fn a_camera_is_calibrated_and_poses_are_exact() {
         "{:?}",
         found.camera
     );
-    // What the lens does at the image's corner, not its coefficients, which replace each other.
+    // Compare the distortion at the image's corners, not the coefficients, which can compensate each other.
     for pixel in [Vec2::new(30.0, 30.0), Vec2::new(930.0, 40.0), Vec2::new(900.0, 690.0)] {
         let ray = |camera: &Camera| {
             let p = camera.undistort_point(&pixel).unwrap();
@@ -126,7 +126,7 @@ fn what_cannot_be_used_is_refused_with_the_reason() {
     // The camera of another image.
     let other = Camera { fx: 2000.0, ..camera() };
     assert!(matches!(board_pose(&corners(&good), &other), Err(BoardError::DoesNotFit { .. })));
-    // A blurred photograph has no tags that can be read, or says so.
+    // A blurred photograph has no readable tags, or is reported as blurred.
     let blurred =
         photograph(&board, &camera(), &truth, &Conditions { blur: 4.0, ..Conditions::default() }, 3);
     let refused = board_pose(&corners(&blurred), &camera());
@@ -134,7 +134,7 @@ fn what_cannot_be_used_is_refused_with_the_reason() {
         matches!(refused, Err(BoardError::Blurred { .. } | BoardError::TooFewTags { .. })),
         "{refused:?}"
     );
-    // So does one of a camera that moved by 13 pixels.
+    // The same for a camera that moved by 13 pixels.
     let moved = RgbImage::from_fn(960, 720, |x, y| {
         let sum: usize = (0..13).map(|i| usize::from(good[((x + i).min(959), y)][0])).sum();
         [(sum / 13) as u8; 3]
@@ -144,7 +144,7 @@ fn what_cannot_be_used_is_refused_with_the_reason() {
         matches!(refused, Err(BoardError::Blurred { .. } | BoardError::TooFewTags { .. })),
         "{refused:?}"
     );
-    // All from one side: nothing tells the focal length.
+    // All from one direction: the focal length is not determined.
     let frontal: Vec<Vec<Corner>> = (0..5)
         .map(|i| {
             let truth = pose(0.002, f64::from(i), 0.45);

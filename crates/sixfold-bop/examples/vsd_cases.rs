@@ -15,7 +15,7 @@ use sixfold_geometry::{Camera, DepthImage, Image, Pose, Vec3};
 use sixfold_mesh::Mesh;
 use sixfold_render::render_depth;
 
-/// A wavy ball of about 0.1 m.
+/// A wavy ball with a size of about 0.1 m.
 fn ball() -> Result<Mesh, Box<dyn Error>> {
     let (rings, steps) = (24u32, 48u32);
     let at = |i: u32, j: u32| {

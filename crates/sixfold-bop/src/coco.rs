@@ -34,45 +34,45 @@ pub struct Detection {
     pub time: Option<f64>,
 }
 
-/// What was done to a detection on reading.
+/// How a detection was changed on reading.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Adjustment {
-    /// The box reached over the image's edge and was clipped to it.
+    /// The box extended beyond the image's border and was clipped to it.
     Clipped,
     /// Box and mask lie outside the image or are empty; the detection was left out.
     Outside,
-    /// The detection is broken and was left out (lenient reading only).
+    /// The detection is invalid and was left out (lenient reading only).
     Broken,
-    /// Detections that name no scene were taken for the only one of a dataset ([`BopDataset::detections`]).
+    /// Detections without a scene were assigned to the dataset's only scene ([`BopDataset::detections`]).
     Scene,
 }
 
 /// A detection that was changed or left out on reading.
 #[derive(Debug, Clone, PartialEq)]
 pub struct AdjustedDetection {
-    /// Its number in the file, from zero.
+    /// Its index in the file, from zero.
     pub index: usize,
-    /// What was done.
+    /// The kind of adjustment.
     pub adjustment: Adjustment,
-    /// Where and why.
+    /// The place and the reason.
     pub message: String,
 }
 
 /// Detections read from a file.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Detections {
-    /// The good ones, in the order of the file.
+    /// The valid detections, in the order of the file.
     pub detections: Vec<Detection>,
-    /// What was clipped or left out.
+    /// Detections that were clipped or left out.
     pub adjusted: Vec<AdjustedDetection>,
-    /// Places in `detections` of those that name no scene, as in COCO's own files; their scene is 0.
+    /// Indices in `detections` of those without a scene, as in COCO's own files; their scene is 0.
     pub without_scene: Vec<usize>,
 }
 
-/// How detections are read.
+/// Options for reading detections.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct ReadDetections {
-    /// Leave broken detections out and report them, rather than refuse the file.
+    /// Leave invalid detections out and report them, rather than refuse the file.
     pub lenient: bool,
     /// Width and height of the images, where known: boxes are clipped to it.
     pub image_size: Option<(usize, usize)>,
@@ -120,7 +120,7 @@ pub fn parse_detections(
             let image = Rect { x: 0.0, y: 0.0, width: width as f64, height: height as f64 };
             match bbox.intersect(&image) {
                 Some(inside) if inside == bbox => {}
-                // The corner of a clipped box is a subtraction away from the one in the file: only report a cut.
+                // Clipping recomputes the corners, which can change the last digits: report only a box that lost area.
                 Some(inside) if bbox.area() - inside.area() <= 1e-9 * bbox.area() => {}
                 Some(inside) => {
                     report(Adjustment::Clipped, &format!("the box {} was clipped to the image", show(&bbox)));
@@ -147,8 +147,8 @@ pub fn parse_detections(
 }
 
 impl BopDataset {
-    /// Reads a file of detections in this dataset's images. COCO knows no scenes: detections that name none are those of the
-    /// dataset's only scene, which is reported, and refused where it has several.
+    /// Reads a file of detections in this dataset's images. COCO has no scenes: detections without a scene are assigned to
+    /// the dataset's only scene, and this is reported. If the dataset has several scenes, such a file is refused.
     ///
     /// # Errors
     /// [`DatasetError`] naming file, entry and field.
@@ -190,7 +190,7 @@ fn present<'v>(map: &'v Map<String, Value>, field: &str) -> Option<&'v Value> {
     map.get(field).filter(|v| !v.is_null() && v.as_array().is_none_or(|a| !a.is_empty()))
 }
 
-/// Largest number of a box, pixels: beyond it numbers of a box cannot be added without loss.
+/// Largest coordinate or size of a box, in pixels: larger numbers could not be added without loss of precision.
 const FURTHEST: f64 = 1e6;
 
 fn parse_bbox(at: &At<'_>, value: &Value) -> Result<Rect, DatasetError> {
@@ -269,7 +269,7 @@ pub fn write_detections(path: &Path, detections: &[Detection]) -> Result<(), Dat
     rows.write(path)
 }
 
-/// A detection as its file has it.
+/// A detection as a row of its file.
 pub(crate) fn detection_row(d: &Detection) -> String {
     let mut map = Map::new();
     map.insert("scene_id".into(), json!(d.scene_id));
@@ -297,18 +297,18 @@ pub struct Annotation {
     pub category_id: u32,
     /// The box.
     pub bbox: Rect,
-    /// Area in pixels that decides between small, medium and large.
+    /// Area in pixels; it decides whether the object counts as small, medium or large.
     pub area: f64,
-    /// A region with many objects: detections in it are neither right nor wrong.
+    /// A region with many objects: detections in it count neither as right nor as wrong.
     pub iscrowd: bool,
     /// The mask.
     pub segmentation: Option<Rle>,
 }
 
-/// Ground truth of detections: images and what is in them.
+/// Ground truth of detections: images and the objects in them.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct CocoGroundTruth {
-    /// `(scene_id, image_id)` of every image, also of those with nothing in them.
+    /// `(scene_id, image_id)` of every image, including those without objects.
     pub images: Vec<(u32, u32)>,
     /// The annotated objects.
     pub annotations: Vec<Annotation>,
@@ -317,7 +317,7 @@ pub struct CocoGroundTruth {
 impl CocoGroundTruth {
     /// Adds the content of a `scene_gt_coco.json`; `path` is for messages.
     ///
-    /// An `ignore` flag is read over, as by pycocotools, which overwrites it with `iscrowd`.
+    /// An `ignore` flag is ignored, as in pycocotools, which overwrites it with `iscrowd`.
     ///
     /// # Errors
     /// [`DatasetError`] naming entry and field.

@@ -1,5 +1,5 @@
-//! A file of detections that grows while a detector works: its rows as text, so that what is read and written again is the same to
-//! the last digit.
+//! A file of detections that grows while a detector runs. Rows are kept as text, so that rows that are read and written again stay
+//! the same to the last digit.
 
 use std::path::Path;
 
@@ -37,27 +37,27 @@ impl DetectionRows {
         self.0.extend(detections.iter().map(|d| ((d.scene_id, d.image_id), detection_row(d))));
     }
 
-    /// Scene and image of each.
+    /// Scene and image of each detection.
     pub fn images(&self) -> impl Iterator<Item = (u32, u32)> {
         self.0.iter().map(|(image, _)| *image)
     }
 
-    /// Keeps those of some images.
+    /// Keeps only the detections of the wanted images.
     pub fn keep_images(&mut self, mut wanted: impl FnMut(u32, u32) -> bool) {
         self.0.retain(|((scene_id, im_id), _)| wanted(*scene_id, *im_id));
     }
 
-    /// Orders them by scene and image; those of an image stay as they are.
+    /// Sorts the detections by scene and image; within an image their order stays.
     pub fn sort_by_image(&mut self) {
         self.0.sort_by_key(|(image, _)| *image);
     }
 
-    /// How many there are.
+    /// Number of detections.
     pub fn len(&self) -> usize {
         self.0.len()
     }
 
-    /// Whether there is none.
+    /// Whether there are no detections.
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()
     }
@@ -93,7 +93,7 @@ mod tests {
             time: Some(score * 0.7),
         };
         let mut rows = DetectionRows::default();
-        // The shortest decimals of many numbers are read wrong in the last bit by a reader in a hurry.
+        // A fast but inexact parser reads the shortest decimals of many numbers wrong in the last bit.
         let all: Vec<Detection> =
             (0..500).map(|i| detection(499 - i / 2, f64::from((i as f32).sin().abs()))).collect();
         rows.add(&all);

@@ -9,7 +9,7 @@ use sixfold_geometry::Rect;
 use crate::coco::{Annotation, CocoGroundTruth, Detection};
 use crate::rle::Rle;
 
-/// What is compared.
+/// Whether boxes or masks are compared.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum IouType {
     /// Boxes; a detection without box counts with the box around its mask.
@@ -65,13 +65,13 @@ struct Candidate<'a> {
     mask: Option<&'a Rle>,
 }
 
-/// What one image says of one object at one range of areas.
+/// The result of one image for one object and one range of areas.
 struct ImageResult {
     scores: Vec<f64>,
-    /// By overlap, then detection: whether it is matched, and whether it is left out of the count.
+    /// By overlap threshold, then by detection: whether it is matched, and whether it is ignored.
     matched: Vec<Vec<bool>>,
     ignored: Vec<Vec<bool>>,
-    /// Ground truth that counts.
+    /// Number of ground-truth objects that count.
     positives: usize,
 }
 
@@ -224,7 +224,7 @@ fn match_image(
                 if taken[g] && !gts[g].iscrowd {
                     continue;
                 }
-                // A match with ground truth that counts is not given up for one that does not.
+                // A match with ground truth that counts is not replaced by one that does not count.
                 if found.is_some_and(|f| !is_ignored(gts[f])) && is_ignored(gts[g]) {
                     break;
                 }

@@ -1,5 +1,5 @@
-//! Ground truth of 2D detection from poses, for datasets without `scene_gt_coco.json`, and scores of detections that
-//! look at how much of an object is visible.
+//! Ground truth of 2D detection from poses, for datasets without `scene_gt_coco.json`, and scores of detections that take the
+//! visibility of objects into account.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -25,13 +25,13 @@ const MIN_VISIBILITY: f64 = 0.1;
 pub struct VisibleTruth {
     /// Images and annotations.
     pub truth: CocoGroundTruth,
-    /// Of each annotation, 0..=1.
+    /// The visible fraction of each annotation, 0..=1.
     pub visible: Vec<f64>,
 }
 
 impl VisibleTruth {
-    /// The ground truth of these images (scene, image): as the scenes' `scene_gt_coco.json` say, where all have one, otherwise
-    /// from poses ([`VisibleTruth::of_poses`]). Those files do not say how much of an object is visible.
+    /// The ground truth of these images (scene, image): from `scene_gt_coco.json` where all scenes have one, otherwise from
+    /// poses ([`VisibleTruth::of_poses`]). `scene_gt_coco.json` does not state how much of an object is visible.
     ///
     /// # Errors
     /// [`DatasetError`].
@@ -56,8 +56,8 @@ impl VisibleTruth {
 
     /// The ground truth of these images (scene, image): boxes as `bbox_visib` (first pixel, last minus first), masks of
     /// what is visible. Where a scene has no masks or no `scene_gt_info.json`, all annotated objects of an image are
-    /// rendered together (with its depth image, if there is one); what is annotated nowhere and hides an object is then
-    /// not known. Objects that are less than 10 % visible become crowds, objects of which nothing is visible are left out.
+    /// rendered together (with the depth image, if there is one); without a depth image, occluders that are not annotated are
+    /// then unknown. Objects that are less than 10 % visible become crowds; objects without visible pixels are left out.
     ///
     /// # Errors
     /// [`DatasetError`].
@@ -116,8 +116,8 @@ impl VisibleTruth {
 }
 
 impl CocoGroundTruth {
-    /// Writes the ground truth as one COCO file that pycocotools reads. COCO knows no scenes: image numbers have to differ
-    /// between them.
+    /// Writes the ground truth as one COCO file that pycocotools reads. COCO has no scenes, so image numbers have to differ
+    /// between scenes.
     ///
     /// # Errors
     /// [`DatasetError::Write`], also when two scenes have an image of the same number.
@@ -176,7 +176,7 @@ impl CocoGroundTruth {
     }
 }
 
-/// How many objects are found at an overlap of 0.5, and how many detections are none.
+/// How many objects are found at an overlap of 0.5, and how many detections are false.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct FoundAtHalf {
     /// Detections with a lower score were left out.
@@ -185,18 +185,18 @@ pub struct FoundAtHalf {
     /// Objects at least this visible counted.
     #[serde(rename = "least_visible")]
     pub min_visibility: f64,
-    /// Those objects.
+    /// Number of those objects.
     pub objects: usize,
-    /// Those found, over their number; `None` without objects.
+    /// Fraction of these objects that is found; `None` without objects.
     pub recall: Option<f64>,
     /// Recall of each object that occurs.
     pub recall_of: BTreeMap<u32, f64>,
-    /// Detections per image that overlap no object of their kind by half, however little it is visible.
+    /// False detections per image: those that overlap no instance of their object by half, however little of it is visible.
     pub false_per_image: f64,
 }
 
-/// Counts by hand what COCO averages: of every image and object, the best detection takes the object it overlaps most, by
-/// at least one half (intersection over union of boxes), then the next best.
+/// Counts directly what COCO averages. For every image and object, detections are matched in order of falling score: each
+/// takes the instance that it overlaps most, if the intersection over union of the boxes is at least one half.
 pub fn found_at_half(
     truth: &VisibleTruth,
     detections: &[Detection],
@@ -246,7 +246,7 @@ pub fn found_at_half(
     }
 }
 
-/// Scores of detections in COCO's terms, with what is found of objects by how visible they are.
+/// COCO's scores of detections, and the fraction of objects found by visibility.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct DetectionScores {
     /// Images with ground truth.
@@ -257,11 +257,12 @@ pub struct DetectionScores {
     /// Average precision of masks, where both sides have some.
     #[serde(rename = "mask")]
     pub masks: Option<CocoScores>,
-    /// Of objects at least 10 % and 40 % visible, where the ground truth says how much they are.
+    /// For objects at least 10 % and at least 40 % visible, where the ground truth states the visibility.
     pub found_at_half: Vec<FoundAtHalf>,
 }
 
-/// Scores detections by boxes, by masks where both sides have some, and by what is found from `min_score` on.
+/// Scores detections by boxes, by masks where both sides have some, and by the objects found with scores of at least
+/// `min_score`.
 pub fn score_detections(truth: &VisibleTruth, detections: &[Detection], min_score: f64) -> DetectionScores {
     let boxes = evaluate_coco(&truth.truth, detections, IouType::Box);
     let with_masks = detections.iter().any(|d| d.segmentation.is_some())
@@ -315,7 +316,7 @@ mod tests {
         ];
         let found = found_at_half(&truth, &detections, 0.0, 0.4);
         assert_eq!((found.objects, found.recall), (2, Some(1.0)));
-        // The second on the same object, and the one of another object.
+        // The second detection of the same object, and the detection of another object.
         assert_eq!(found.false_per_image, 1.0);
         let sure = found_at_half(&truth, &detections, 0.5, 0.0);
         assert_eq!((sure.objects, sure.recall), (3, Some(1.0 / 3.0)));

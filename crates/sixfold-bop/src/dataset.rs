@@ -1,6 +1,6 @@
 //! A BOP dataset on disk: split, scenes, images, models. Text files are checked when a scene is opened; images are
-//! read when they are asked for. What a dataset leaves out (depth, masks, ground truth, models) is `None`, what is
-//! broken is an error.
+//! read when they are asked for. What a dataset does not contain (depth, masks, ground truth, models) is `None`; an invalid file is
+//! an error.
 
 use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet};
@@ -18,13 +18,13 @@ use crate::scene_files::{
     parse_scene_gt_info, parse_targets,
 };
 
-/// Which of a dataset's model folders, where none was chosen by [`BopDataset::with_models`].
+/// Which of a dataset's model folders is used, where none was chosen by [`BopDataset::with_models`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Models {
     /// `models_eval` where there is one (uniformly resampled, without inner faces), otherwise `models`.
     #[default]
     Evaluation,
-    /// `models`: what is rendered.
+    /// `models`: the models for rendering.
     Rendering,
 }
 
@@ -43,7 +43,7 @@ pub struct BopDataset {
     scenes: BTreeMap<u32, PathBuf>,
     /// The chosen folder of models.
     models: Option<PathBuf>,
-    /// What was read of [`Models::Evaluation`] and [`Models::Rendering`], every model being compared with it.
+    /// `models_info.json` of [`Models::Evaluation`] and of [`Models::Rendering`], once read; every model is checked against it.
     infos: Arc<[OnceLock<NamedInfos>; 2]>,
 }
 
@@ -142,7 +142,7 @@ impl BopDataset {
         Scene::read(scene_id, dir, self.size.clone())
     }
 
-    /// The folder of models that will be used, if the dataset has one: the chosen one, otherwise that of the use.
+    /// The folder of models that will be used, if the dataset has one: the chosen folder, otherwise the one for `models`.
     pub fn models_dir(&self, models: Models) -> Option<PathBuf> {
         if let Some(chosen) = &self.models {
             return Some(chosen.clone());
@@ -188,7 +188,7 @@ impl BopDataset {
         Ok(None)
     }
 
-    /// Where the model of an object is, or would be.
+    /// The path of an object's model file, whether or not it exists.
     pub fn model_path(&self, obj_id: u32, models: Models) -> PathBuf {
         let dir = self.models_dir(models).unwrap_or_else(|| self.root.join("models"));
         dir.join(format!("obj_{obj_id:06}.ply"))
@@ -213,10 +213,10 @@ impl BopDataset {
         Ok(mesh)
     }
 
-    /// What has to be found: from `file`, or the dataset's `test_targets_bop19.json`, or where neither exists every
-    /// ground-truth pose of the split that is at least 10 % visible (or of unknown visibility).
+    /// The targets: from `file`, or from the dataset's `test_targets_bop19.json`, or, where neither exists, every ground-truth pose
+    /// of the split that is at least 10 % visible (or of unknown visibility).
     ///
-    /// Targets in the BOP'24 form (images only) stay as they are; [`BopDataset::object_targets`] spells them out.
+    /// Targets in the BOP'24 form (images only) stay as they are; [`BopDataset::object_targets`] expands them to one per object.
     ///
     /// # Errors
     /// [`DatasetError`] when a file is missing or broken.
@@ -228,7 +228,7 @@ impl BopDataset {
         parse_targets(&text, path)
     }
 
-    /// Every ground-truth pose of the split that is at least 10 % visible (or of unknown visibility), whatever targets files there are.
+    /// Every ground-truth pose of the split that is at least 10 % visible (or of unknown visibility), regardless of targets files.
     ///
     /// # Errors
     /// [`DatasetError`] when a scene is broken.
@@ -301,7 +301,7 @@ pub(crate) fn list_ids<'a>(ids: impl ExactSizeIterator<Item = &'a u32>) -> Strin
     text
 }
 
-/// Width and height of `camera.json`, where it is there and has them.
+/// Width and height from `camera.json`, where the file exists and states them.
 fn read_camera_size(path: &Path) -> Result<Option<StatedSize>, DatasetError> {
     if !path.is_file() {
         return Ok(None);
@@ -330,7 +330,7 @@ fn read_camera_size(path: &Path) -> Result<Option<StatedSize>, DatasetError> {
     Ok(Some((size, path.to_owned())))
 }
 
-/// One image of a scene: what the text files say of it.
+/// One image of a scene: its entries in the text files.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SceneImage {
     /// Its id.
@@ -339,7 +339,7 @@ pub struct SceneImage {
     pub camera: ImageCamera,
     /// The objects in it; empty where the scene has no ground truth.
     pub ground_truth: Vec<GroundTruth>,
-    /// What `scene_gt_info.json` says of each of them, in the same order.
+    /// The entry of each object in `scene_gt_info.json`, in the same order.
     pub info: Option<Vec<GroundTruthInfo>>,
 }
 
@@ -353,12 +353,12 @@ impl SceneImage {
     }
 }
 
-/// Which mask of an object.
+/// A kind of mask of an object.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum MaskKind {
     /// The whole silhouette inside the image (`mask`).
     Full,
-    /// What is visible (`mask_visib`).
+    /// The visible part (`mask_visib`).
     Visible,
 }
 
@@ -443,7 +443,7 @@ impl Scene {
         self.has_ground_truth
     }
 
-    /// What the text files say of an image.
+    /// The entries of an image in the text files.
     ///
     /// # Errors
     /// [`DatasetError::NoImage`].
@@ -479,7 +479,7 @@ impl Scene {
         let k = image.camera;
         let camera = Camera { fx: k.fx, fy: k.fy, cx: k.cx, cy: k.cy, width, height, distortion: None };
         let path = self.dir.join("scene_camera.json");
-        // Also that of a crop: its principal point may lie outside.
+        // This also holds for the camera of a crop, whose principal point may lie outside the image.
         camera
             .check_lens()
             .map_err(|e| At::image(&path, im_id).error("cam_K", e.to_string(), "a camera of this image"))?;

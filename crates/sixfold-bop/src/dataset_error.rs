@@ -1,17 +1,17 @@
-//! What can be wrong with a dataset on disk: every message names the file, the place in it, what was expected, what
-//! was found and what to do.
+//! Errors of datasets on disk: every message names the file, the place in it, the values expected and found, and
+//! what to do.
 
 use std::path::PathBuf;
 
 use sixfold_io::ImageFileError;
 use thiserror::Error;
 
-/// Where in a scene file something is: image, then number in that image's list.
+/// A place in a scene file: the image, then the index in that image's list.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Place {
     /// The image.
     pub im_id: Option<u32>,
-    /// Number of the entry, from zero.
+    /// Index of the entry, from zero.
     pub index: Option<usize>,
 }
 
@@ -31,12 +31,12 @@ impl std::fmt::Display for Place {
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum DatasetError {
-    /// Something that has to be there is not.
+    /// A required file or folder is missing.
     #[error("{}: {what} is missing; {advice}", path.display())]
     Missing {
-        /// Where it should be.
+        /// The expected path.
         path: PathBuf,
-        /// What it is.
+        /// Its description.
         what: &'static str,
         /// What to do.
         advice: &'static str,
@@ -46,7 +46,7 @@ pub enum DatasetError {
     Read {
         /// The file or folder.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
     /// The system could not write a file.
@@ -54,7 +54,7 @@ pub enum DatasetError {
     Write {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
     /// A file is not JSON.
@@ -68,7 +68,7 @@ pub enum DatasetError {
         /// What and where.
         source: serde_json::Error,
     },
-    /// A field holds something else than it should.
+    /// A field holds an invalid value.
     #[error("{}: {place}field {field}: found {found}, expected {expected}", path.display())]
     Field {
         /// The file.
@@ -77,9 +77,9 @@ pub enum DatasetError {
         place: Place,
         /// Name of the field.
         field: String,
-        /// What it held.
+        /// Its value.
         found: String,
-        /// What it should hold.
+        /// The expected value.
         expected: String,
     },
     /// An image file cannot be decoded.
@@ -92,7 +92,7 @@ pub enum DatasetError {
         /// What is wrong.
         reason: String,
     },
-    /// Which pixels of an image file are a mask is not clear.
+    /// It is not clear which pixels of an image file belong to the mask.
     #[error("{}: im_id {im_id}: mask: {reason}", path.display())]
     Mask {
         /// The file.
@@ -117,28 +117,28 @@ pub enum DatasetError {
         expected: (usize, usize),
         /// Width and height found.
         found: (usize, usize),
-        /// Where the expectation comes from.
+        /// The file that states the expected size.
         size_from: String,
     },
-    /// A scene was asked for that is not there.
+    /// The requested scene does not exist.
     #[error("{}: scene {scene_id} is not there; the split has scenes {known}", path.display())]
     NoScene {
         /// Folder of the split.
         path: PathBuf,
-        /// What was asked for.
+        /// The requested scene.
         scene_id: u32,
-        /// What there is.
+        /// The existing scenes.
         known: String,
     },
-    /// An image was asked for that the scene does not have.
+    /// The scene does not have the requested image.
     #[error("{}: im_id {im_id} is not there; was the right split given?", path.display())]
     NoImage {
         /// The file that should have it.
         path: PathBuf,
-        /// What was asked for.
+        /// The requested image.
         im_id: u32,
     },
-    /// Nothing says how large the images are.
+    /// The size of the images is stated nowhere.
     #[error(
         "{}: im_id {im_id}: the image size is unknown; camera.json has no width and height and there is no rgb, \
          gray or depth image",
@@ -158,7 +158,7 @@ pub enum DatasetError {
         /// The object.
         obj_id: u32,
     },
-    /// Whoever received the progress asked to stop.
+    /// The receiver of the progress reports asked to stop.
     #[error("stopped")]
     Stopped,
     /// A model or `models_info.json` is broken.

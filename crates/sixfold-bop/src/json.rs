@@ -1,4 +1,4 @@
-//! Typed access to JSON values with errors that say where they are.
+//! Typed access to JSON values, with errors that state the place in the file.
 
 use std::path::Path;
 
@@ -7,14 +7,14 @@ use sixfold_geometry::{Mat3, Pose, Vec3};
 
 use crate::dataset_error::{DatasetError, Place};
 
-/// A value and where it came from.
+/// A value and its place in the file.
 #[derive(Clone, Copy)]
 pub(crate) struct At<'a> {
     pub path: &'a Path,
     pub place: Place,
 }
 
-/// What a value is, short enough for a message.
+/// A description of a value, short enough for a message.
 pub(crate) fn describe(value: &Value) -> String {
     let text = match value {
         Value::Array(items) => return format!("a list of {}", items.len()),
@@ -105,8 +105,8 @@ impl<'a> At<'a> {
         Ok(out)
     }
 
-    /// A pose from a row-major rotation and a translation in millimetres, both in `map`; and the rotation as it stands
-    /// there.
+    /// A pose from a row-major rotation and a translation in millimetres, both in `map`; and the rotation as it is
+    /// written there.
     pub(crate) fn pose_mm(
         &self,
         map: &Map<String, Value>,

@@ -76,8 +76,8 @@ fn axes(canvas: &mut Canvas, left: f64, top: f64, width: f64, height: f64) {
     canvas.rectangle(left - 1.0, top + height - 0.5, width + 1.0, 1.5, INK);
 }
 
-/// Draws the recall curves of MSSD, MSPD, VSD and ADD(-S): one panel each, a thin line an object, a thick one for all
-/// targets together.
+/// Draws the recall curves of MSSD, MSPD, VSD and ADD(-S): one panel per error, a thin line per object, a thick line
+/// for all targets together.
 pub fn draw_recall_curves(evaluation: &Evaluation) -> RgbImage {
     let mut canvas = Canvas::new(2 * PANEL_WIDTH + LEGEND_WIDTH, 2 * PANEL_HEIGHT);
     let mut ids: Vec<String> = evaluation.objects.keys().cloned().collect();
@@ -104,7 +104,7 @@ pub fn draw_recall_curves(evaluation: &Evaluation) -> RgbImage {
         y += 22.0;
     };
     entry("all targets", 3.4, INK);
-    // What does not fit the image is counted instead.
+    // Objects whose names do not fit the image are only counted.
     let shown = ids.len().min((2 * PANEL_HEIGHT - 2 * TOP) / 22 - 2);
     for (n, id) in ids.iter().take(shown).enumerate() {
         entry(&format!("object {id}"), 1.6, COLORS[n % COLORS.len()]);
@@ -166,7 +166,8 @@ mod tests {
     fn the_thick_line_is_where_the_recall_is() {
         for recall in [0.25, 0.75] {
             let picture = draw_recall_curves(&evaluation(recall));
-            // The curve is level in the right half of the first panel; look down a column three quarters across.
+            // The curve is level in the right half of the first panel: scan the column at three quarters of its
+            // width.
             let x = LEFT + (PANEL_WIDTH - LEFT - RIGHT) * 3 / 4 + 7;
             let dark: Vec<usize> =
                 (TOP..PANEL_HEIGHT - BOTTOM - 4).filter(|&y| picture[(x, y)] == INK).collect();

@@ -6,12 +6,12 @@
 
 use sixfold_geometry::{Mat3, Vec3};
 
-/// Points in a leaf of the tree: what a search for the nearest neighbour looks through at the end.
+/// Points in a leaf of the tree, which a search for the nearest neighbour tests one by one.
 const LEAF_SIZE: usize = 24;
-/// Looking through this many points is cheaper than asking for the bounds of their parts.
+/// Testing this many points is cheaper than computing the bounds of their parts.
 const WHOLE_SIZE: usize = 128;
 
-/// Points that lie close together: their range, a box and a ball around them.
+/// A node of the tree: a range of nearby points, with a box and a ball around them.
 #[derive(Debug, Clone)]
 pub(crate) struct Node {
     low: [f64; 3],
@@ -24,8 +24,8 @@ pub(crate) struct Node {
     children: usize,
 }
 
-/// At least the spectral norm of `a`, how much longer a vector can become, and at most 9 % more for the difference of
-/// two rotations: the Schatten norm of order 8.
+/// An upper bound on the spectral norm of `a` (the largest factor by which it lengthens a vector): the Schatten norm
+/// of order 8. For the difference of two rotations it is at most 9 % larger than the spectral norm.
 pub(crate) fn stretch(a: &Mat3) -> f64 {
     let squared = a.transpose() * a;
     let fourth = squared * squared;
@@ -74,7 +74,7 @@ impl ModelPoints {
         })
     }
 
-    /// How many points there are; never zero.
+    /// Number of points; never zero.
     #[allow(clippy::len_without_is_empty)]
     pub fn len(&self) -> usize {
         self.x.len()
@@ -85,10 +85,11 @@ impl ModelPoints {
         Vec3::new(self.x[i], self.y[i], self.z[i])
     }
 
-    /// The largest of a number that every point has, or any number above `give_up` once it is known to be above.
+    /// The maximum over all points of a number per point, or any number above `give_up` once the maximum is known to
+    /// be above it.
     ///
-    /// `bound(node)` is at least the root of the number of every point in the node, `largest(node)` is the largest
-    /// number in a small node. Nodes that cannot beat the best point so far are passed over.
+    /// `bound(node)` is an upper bound on the square root of that number for the points of the node, `largest(node)`
+    /// the maximum of the number in a small node. Nodes that cannot exceed the best point so far are skipped.
     pub(crate) fn largest(
         &self,
         give_up: f64,
@@ -102,7 +103,7 @@ impl ModelPoints {
         while depth > 0 && best <= give_up {
             depth -= 1;
             let (limit, index) = stack[depth];
-            // The margin keeps rounding in the bound from hiding a point.
+            // The margin keeps rounding in the bound from skipping a point.
             if limit * (1.0 + 1e-9) < needed {
                 continue;
             }
@@ -122,7 +123,8 @@ impl ModelPoints {
         best
     }
 
-    /// The largest `|a p + b|^2` over all points, or any number above `give_up` once it is known to be above.
+    /// The largest `|a p + b|^2` over all points, or any number above `give_up` once the maximum is known to be above
+    /// it.
     pub(crate) fn largest_squared(&self, a: &Mat3, b: &Vec3, give_up: f64) -> f64 {
         let stretch = stretch(a);
         let in_leaf = |leaf: &Node| {
@@ -136,7 +138,8 @@ impl ModelPoints {
     pub(crate) fn mean_norm(&self, a: &Mat3, b: &Vec3) -> f64 {
         // Eight fixed partial sums: the compiler may use vector registers, the result is always the same.
         const LANES: usize = 8;
-        // With a = q r, q orthogonal and r upper triangular, |a p + b| = |r p + q^T b|: a third less to multiply.
+        // With a = q r, q orthogonal and r upper triangular, |a p + b| = |r p + q^T b|: a third fewer
+        // multiplications.
         let (q, r) = a.qr().unpack();
         let c = q.transpose() * b;
         let mut sums = [0.0f64; LANES];
@@ -167,7 +170,8 @@ impl ModelPoints {
         let mut last = 0;
         for i in 0..queries.len() {
             let query = rotation * queries.point(i) + translation;
-            // Two guesses that are close in practice: the point itself and the neighbour of the point before.
+            // Two first guesses that are close in practice: the point itself and the nearest neighbour of the
+            // previous point.
             let same = i.min(self.len() - 1);
             let own = (self.point(same) - query).norm_squared();
             let before = (self.point(last) - query).norm_squared();

@@ -24,14 +24,14 @@ pub struct Estimate {
     pub im_id: u32,
     /// The object.
     pub obj_id: u32,
-    /// Confidence; any finite number, higher is surer.
+    /// Confidence; any finite number, higher is more confident.
     pub score: f64,
     /// The pose.
     pub camera_from_object: Pose,
     /// Seconds that all estimates of this image took together; `None` where not measured (-1 in the file).
     pub time: Option<f64>,
-    /// The rotation as the file had it, where it came from one; the pose holds the nearest true rotation. The errors
-    /// of an evaluation are computed with these numbers, as the official one does.
+    /// The rotation as written in the file, if it came from one; the pose holds the nearest true rotation. An
+    /// evaluation computes errors with these numbers, as the official one does.
     pub rotation_as_written: Option<Mat3>,
 }
 
@@ -42,7 +42,7 @@ impl Estimate {
         Estimate { scene_id, im_id, obj_id, score, camera_from_object, time, rotation_as_written }
     }
 
-    /// The pose as the evaluation sees it.
+    /// The pose as the evaluation uses it.
     pub fn placement(&self) -> Placement {
         let rotation = self.rotation_as_written.unwrap_or_else(|| self.camera_from_object.rotation_matrix());
         Placement { rotation, translation: self.camera_from_object.translation() }
@@ -53,7 +53,7 @@ impl Estimate {
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ResultsError {
-    /// A row is not what it should be.
+    /// A row is invalid.
     #[error("{}: {row}", path.display())]
     Row {
         /// The file.
@@ -74,7 +74,7 @@ pub enum ResultsError {
     Read {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: io::Error,
     },
     /// The system could not write the file.
@@ -82,7 +82,7 @@ pub enum ResultsError {
     Write {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: io::Error,
     },
 }
@@ -95,9 +95,9 @@ pub struct BadRow {
     pub line: usize,
     /// Name of the column.
     pub column: &'static str,
-    /// What it held.
+    /// Its value.
     pub found: String,
-    /// What it should hold.
+    /// The expected value.
     pub expected: String,
 }
 
@@ -229,7 +229,7 @@ pub fn write_results(path: &Path, estimates: &[Estimate]) -> Result<(), ResultsE
         .map_err(|source| ResultsError::Write { path: path.to_owned(), source })
 }
 
-/// A result file that grows: what a run that was cut off has written is kept, a line torn by the cut is dropped.
+/// A result file that grows. The rows of an interrupted run are kept; an incomplete last line is dropped.
 #[derive(Debug)]
 pub struct ResultsAppender {
     path: PathBuf,
@@ -239,11 +239,12 @@ pub struct ResultsAppender {
 }
 
 impl ResultsAppender {
-    /// Opens or creates the file and reads what is there. A last line without line break is taken for torn and cut
-    /// off the file: what it said can be computed again, half a number cannot be distinguished from a whole one.
+    /// Opens or creates the file and reads what is there. A last line without a line break is taken to be incomplete
+    /// and is removed from the file: it can be computed again, while a truncated number cannot be distinguished from a
+    /// whole one.
     ///
     /// # Errors
-    /// [`ResultsError`]; a bad row that is not the torn last one is an error, as in [`read_results`].
+    /// [`ResultsError`]; any other bad row is an error, as in [`read_results`].
     pub fn open(path: &Path) -> Result<Self, ResultsError> {
         let write_error = |source| ResultsError::Write { path: path.to_owned(), source };
         make_folder_of(path).map_err(write_error)?;
@@ -276,17 +277,17 @@ impl ResultsAppender {
         Ok(ResultsAppender { path: path.to_owned(), file, existing, torn })
     }
 
-    /// What the file held when it was opened.
+    /// The estimates in the file when it was opened.
     pub fn existing(&self) -> &[Estimate] {
         &self.existing
     }
 
-    /// The torn last line that was dropped, for a message.
+    /// The incomplete last line that was dropped, for a message.
     pub fn torn(&self) -> Option<&str> {
         self.torn.as_deref()
     }
 
-    /// Appends the estimates of one image in a single write and hands them to the disk.
+    /// Appends the estimates of one image in a single write and flushes them to the disk.
     ///
     /// # Errors
     /// [`ResultsError::Write`].

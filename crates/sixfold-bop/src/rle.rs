@@ -1,19 +1,19 @@
-//! COCO's run-length encoded masks: column by column, runs of zeros and ones in turn, starting with zeros; and their
-//! compressed text form.
+//! COCO's run-length encoded masks: column by column, alternating runs of zeros and ones, starting with zeros; and
+//! their compressed text form.
 
 use sixfold_geometry::{Image, Mask, Rect};
 use thiserror::Error;
 
-/// Largest mask side that is believed.
+/// Largest mask side that is accepted.
 const LARGEST_SIDE: u64 = 1 << 16;
-/// Largest number of mask pixels that is believed.
+/// Largest number of mask pixels that is accepted.
 const LARGEST_AREA: u64 = 1 << 28;
 
 /// Why a run-length encoded mask is refused.
 #[derive(Debug, Error, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum RleError {
-    /// The size is empty or absurd.
+    /// The size is zero or too large.
     #[error("size [{height}, {width}], expected height and width from 1 to 65536 and at most 2^28 pixels")]
     Size {
         /// Columns.
@@ -29,7 +29,7 @@ pub enum RleError {
         /// Sum of the runs.
         found: u64,
     },
-    /// The text is not what the compressed form allows.
+    /// The text is not valid in the compressed form.
     #[error("compressed counts: byte {at} is not part of a run length")]
     Text {
         /// Position in the text.
@@ -42,7 +42,7 @@ pub enum RleError {
 pub struct Rle {
     width: u32,
     height: u32,
-    /// Lengths of runs of zeros and ones in turn, zeros first; they fill the mask exactly.
+    /// Lengths of alternating runs of zeros and ones, zeros first; they fill the mask exactly.
     counts: Vec<u32>,
 }
 
@@ -50,7 +50,7 @@ impl Rle {
     /// From runs, column by column, zeros first.
     ///
     /// # Errors
-    /// [`RleError`] when the size is absurd or the runs do not add up to it.
+    /// [`RleError`] when the size is zero or too large, or the runs do not add up to it.
     pub fn new(width: u64, height: u64, counts: Vec<u32>) -> Result<Self, RleError> {
         let (width, height) = check_size(width, height)?;
         let expected = u64::from(width) * u64::from(height);
@@ -65,7 +65,7 @@ impl Rle {
     /// first, each a character from `0` up; 32 in a group says that more follow, 16 in the last is the sign.
     ///
     /// # Errors
-    /// [`RleError`] when the size is absurd, the text damaged or the runs do not add up to the size.
+    /// [`RleError`] when the size is zero or too large, the text is damaged, or the runs do not add up to the size.
     pub fn from_compressed(width: u64, height: u64, text: &str) -> Result<Self, RleError> {
         let (w, h) = check_size(width, height)?;
         let pixels = i64::from(w) * i64::from(h);
@@ -188,7 +188,7 @@ impl Rle {
                 let last = at + count - 1;
                 left = left.min(at / h);
                 right = right.max(last / h);
-                // A run over a column's end touches the first and the last row.
+                // A run across the end of a column touches the first and the last row.
                 let (low, high) = if at / h == last / h { (at % h, last % h) } else { (0, h - 1) };
                 top = top.min(low);
                 bottom = bottom.max(high);

@@ -13,10 +13,10 @@ use crate::dataset_error::DatasetError;
 use crate::errors::Placement;
 use crate::json::{At, by_image, describe, parse};
 
-/// Most instances of an object in one image that targets may ask for: all of them are searched for, and scored.
+/// Largest number of instances of an object in one image that targets may request: all of them are searched for and scored.
 const MAX_INSTANCES: usize = 1000;
 
-/// Intrinsics of one image without its size, and what turns a depth pixel into metres.
+/// Intrinsics of one image without its size, and the unit of its depth.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ImageCamera {
     /// Focal length in x, pixels.
@@ -27,7 +27,7 @@ pub struct ImageCamera {
     pub cx: f64,
     /// Principal point y, pixels.
     pub cy: f64,
-    /// Metres per unit of the depth image (BOP's `depth_scale` is millimetres per unit). `None` in scenes without.
+    /// Metres per unit of the depth image (BOP's `depth_scale` is millimetres per unit). `None` in scenes without it.
     pub depth_scale: Option<f64>,
     /// Pose of the world in the camera frame, where the scene has one.
     pub camera_from_world: Option<Pose>,
@@ -36,13 +36,12 @@ pub struct ImageCamera {
 /// One object in one image.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GroundTruth {
-    /// Which object.
+    /// Id of the object.
     pub obj_id: u32,
     /// Its pose.
     pub camera_from_object: Pose,
-    /// The rotation as the file had it, where it came from one (LM-O's are up to a thousandth off a rotation); the
-    /// pose holds the nearest true rotation. The errors of an evaluation are computed with these numbers, as the
-    /// official one does.
+    /// The rotation as written in the file, if it came from one (LM-O's differ from a rotation by up to a thousandth); the
+    /// pose holds the nearest true rotation. An evaluation computes errors with these numbers, as the official one does.
     pub rotation_as_written: Option<Mat3>,
 }
 
@@ -52,15 +51,15 @@ impl GroundTruth {
         GroundTruth { obj_id, camera_from_object, rotation_as_written: None }
     }
 
-    /// The pose as the evaluation sees it.
+    /// The pose as the evaluation uses it.
     pub fn placement(&self) -> Placement {
         let rotation = self.rotation_as_written.unwrap_or_else(|| self.camera_from_object.rotation_matrix());
         Placement { rotation, translation: self.camera_from_object.translation() }
     }
 }
 
-/// What `scene_gt_info.json` says of one ground-truth pose. Boxes are as BOP writes them: first pixel, then last
-/// minus first pixel; `None` where BOP writes -1 because nothing is visible.
+/// The entry of one ground-truth pose in `scene_gt_info.json`. Boxes are as BOP writes them: first pixel, then last minus
+/// first pixel; `None` where BOP writes -1 because nothing is visible.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GroundTruthInfo {
     /// Box of the whole silhouette, parts outside the image and behind others included.
@@ -77,23 +76,23 @@ pub struct GroundTruthInfo {
     pub visib_fract: f64,
 }
 
-/// What has to be found: one object in one image, or (BOP'24) everything in one image.
+/// A target: one object in one image, or (BOP'24) all objects in one image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Target {
     /// The scene.
     pub scene_id: u32,
     /// The image.
     pub im_id: u32,
-    /// The object and how many instances of it are to be found; `None` in the BOP'24 format.
+    /// The object and the number of its instances to find; `None` in the BOP'24 format.
     pub object: Option<TargetObject>,
 }
 
 /// The object of a [`Target`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct TargetObject {
-    /// Which object.
+    /// Id of the object.
     pub obj_id: u32,
-    /// How many instances are to be found.
+    /// Number of instances to find.
     pub inst_count: usize,
 }
 
@@ -122,7 +121,7 @@ pub fn parse_scene_camera(text: &[u8], path: &Path) -> Result<BTreeMap<u32, Imag
             return Err(at.error("cam_K (fx, fy)", format!("{} and {}", k[0], k[4]), expected));
         }
         check_lens_keys(&at, map)?;
-        // A skew is a number in some files' rounding; anything above a thousandth of a pixel is a real one.
+        // In some files rounding leaves a tiny skew; anything above a thousandth of a pixel is a real one.
         for (i, expected) in [(1, 0.0), (3, 0.0), (6, 0.0), (7, 0.0), (8, 1.0)] {
             if (k[i] - expected).abs() > 1e-3 {
                 return Err(at.error(
@@ -161,8 +160,8 @@ pub fn parse_scene_camera(text: &[u8], path: &Path) -> Result<BTreeMap<u32, Imag
     Ok(cameras)
 }
 
-/// Refuses what changes where a point is seen and is not read: a lens that is no pinhole. Other keys are notes on how an image
-/// was taken.
+/// Refuses keys that would change the projection but are not supported: lens models other than the pinhole. Other keys are
+/// notes on how an image was taken.
 fn check_lens_keys(at: &At<'_>, map: &Map<String, Value>) -> Result<(), DatasetError> {
     let pinhole = |value: &Value| value.is_null() || value.as_str() == Some("pinhole");
     if let Some(model) = map.get("cam_model").filter(|value| !pinhole(value)) {

@@ -43,7 +43,7 @@ pub(crate) fn greedy_matches(errors: &[Vec<f64>], valid: &[bool], threshold: f64
 
 /// Average precision with COCO's 101 recall steps, as the BOP Challenge 2024 computes it.
 ///
-/// `right` says of each detection, in order of falling score, whether it is matched; `positives` is the number of
+/// `right` states for each detection, in order of falling score, whether it is matched; `positives` is the number of
 /// ground-truth poses. `None` without ground truth.
 pub fn average_precision(right: &[bool], positives: usize) -> Option<f64> {
     if positives == 0 {
@@ -82,7 +82,7 @@ pub fn area_under_accuracy(errors: &[f64], largest: f64) -> Option<f64> {
     let mut area = 0.0;
     let mut from = 0.0;
     for (i, &error) in below.iter().enumerate() {
-        // The accuracy of this error holds from the error before it on: VOC's monotone envelope.
+        // The accuracy at this error applies from the previous error on: VOC's monotone envelope.
         area += (error - from) * (i + 1) as f64 / total;
         from = error;
     }

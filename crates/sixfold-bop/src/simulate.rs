@@ -1,4 +1,4 @@
-//! What a depth camera would have measured in a dataset that has poses but no depth.
+//! Simulated depth images for a dataset that has poses but no depth.
 
 use std::collections::BTreeMap;
 
@@ -14,9 +14,9 @@ use crate::{
 pub struct DepthSimulation<'a> {
     /// The dataset with ground truth.
     pub dataset: &'a BopDataset,
-    /// The depth camera; none: the ideal one.
+    /// The depth camera; `None` for an ideal one.
     pub sensor: Option<DepthSensor>,
-    /// Whether a table stands under the objects where a plane fits.
+    /// Whether a table is added under the objects where a plane fits.
     pub with_table: bool,
     /// Whether colour images are copied.
     pub with_rgb: bool,
@@ -26,7 +26,7 @@ pub struct DepthSimulation<'a> {
 }
 
 impl<'a> DepthSimulation<'a> {
-    /// With an ideal camera, a table, without colour images.
+    /// A simulation with an ideal camera and a table, without colour images.
     pub fn new(dataset: &'a BopDataset) -> Self {
         DepthSimulation {
             dataset,

@@ -9,7 +9,7 @@ fn digits(score: Option<f64>) -> String {
     score.map_or_else(|| "-".into(), |s| format!("{s:.3}"))
 }
 
-/// The scores of a result file, a line per object, and why a score is missing.
+/// The scores of a result file, one line per object, and the reasons for missing scores.
 pub fn score_table(e: &Evaluation) -> String {
     let mut text = String::new();
     // Writing to a string cannot fail, here and below.
@@ -42,7 +42,7 @@ pub fn score_table(e: &Evaluation) -> String {
     text
 }
 
-/// The scores of 6D detection, and why one is missing.
+/// The scores of 6D detection, and the reasons for missing scores.
 pub fn detection_score_table(d: &DetectionEvaluation) -> String {
     let [ap, mssd, mspd] = [d.ap, d.ap_mssd, d.ap_mspd].map(digits);
     let mut text = format!("6D detection (BOP'24): AP {ap} AP_MSSD {mssd} AP_MSPD {mspd}\n");

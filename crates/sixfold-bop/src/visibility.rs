@@ -29,10 +29,10 @@ pub struct ObjectVisibility {
     pub info: GroundTruthInfo,
 }
 
-/// Renders every object and says what of it is visible.
+/// Renders every object and computes which part of it is visible.
 ///
 /// `test_depth` is the sensor's depth image in metres, of the camera's size; `delta` the tolerance of the visibility
-/// test in metres ([`VISIBILITY_DELTA`] in BOP). A depth image of another size is as good as none, so check it before.
+/// test in metres ([`VISIBILITY_DELTA`] in BOP). A depth image of another size is ignored, so check the size first.
 pub fn ground_truth_visibility(
     objects: &[(&Mesh, Pose)],
     camera: &Camera,
@@ -98,7 +98,7 @@ pub fn ground_truth_visibility(
 }
 
 impl GroundTruthInfo {
-    /// Of an object whose silhouette lies within the image, every pixel of it measured.
+    /// The entry of an object whose silhouette lies within the image, with depth at every pixel.
     pub fn of_masks(whole: &Mask, visible: &Mask) -> Self {
         let count = |mask: &Mask| mask.as_slice().iter().filter(|v| **v).count() as u64;
         let (all, seen) = (count(whole), count(visible));
@@ -183,7 +183,8 @@ mod tests {
         assert_eq!(found[0].info.visib_fract, 0.5);
         assert_eq!(found[1].info.visib_fract, 1.0);
 
-        // The sensor sees something 20 mm in front of the upper rows only; in the lower rows 10 mm, in one nothing.
+        // The measured depth is 20 mm in front of the object in the upper rows, 10 mm in front in the lower rows, and
+        // missing in one row.
         let depth = Image::from_fn(100, 80, |_, y| {
             if y < 35 {
                 0.98

@@ -23,7 +23,7 @@ pub struct NewImage<'a> {
     pub camera_from_world: Option<Pose>,
     /// Colour.
     pub rgb: Option<&'a RgbImage>,
-    /// Depth in metres; what does not fit 16 bit is stored as missing.
+    /// Depth in metres; values that do not fit 16 bits are stored as missing.
     pub depth: Option<&'a DepthImage>,
     /// The objects.
     pub ground_truth: &'a [GroundTruth],
@@ -36,7 +36,7 @@ pub struct NewImage<'a> {
 }
 
 impl<'a> NewImage<'a> {
-    /// An image with its camera and nothing else, depth in whole millimetres.
+    /// An image with only its camera, depth in whole millimetres.
     pub fn new(im_id: u32, camera: &'a Camera) -> Self {
         NewImage {
             im_id,
@@ -202,7 +202,7 @@ fn write_by_image(path: &Path, images: &BTreeMap<u32, Value>) -> Result<(), Data
     write_text(path, &format!("{{\n{}\n}}\n", lines.join(",\n")))
 }
 
-/// Removes the last digits that a change of unit leaves behind (1e-4 m is 0.1 mm, not 0.10000000000000002).
+/// Removes the rounding errors that a change of unit leaves (1e-4 m is 0.1 mm, not 0.10000000000000002).
 fn tidy(value: f64) -> f64 {
     let rounded = (value * 1e9).round() / 1e9;
     if (rounded - value).abs() <= 1e-12 * value.abs() { rounded } else { value }

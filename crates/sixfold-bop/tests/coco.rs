@@ -23,7 +23,7 @@ fn assert_close(case: &str, found: &CocoScores, expected: &serde_json::Value) {
     let names = expected.as_object().unwrap();
     assert_eq!(names.len(), 12);
     for (name, expected) in names {
-        // pycocotools writes -1 where there is nothing to average.
+        // pycocotools writes -1 if there is nothing to average.
         let found = found[name].as_f64().unwrap_or(-1.0);
         let expected = expected.as_f64().unwrap();
         assert!((found - expected).abs() < 1e-9, "{case} {name}: {found}, pycocotools says {expected}");

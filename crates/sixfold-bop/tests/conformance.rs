@@ -35,7 +35,7 @@ fn lmo_published_results_score_as_the_official_toolkit_says() {
     }
     assert_eq!(found.targets as u64, expected["targets"].as_u64().unwrap());
 
-    // One of the hundred frames has depth: no VSD, no AR, and the reasons say so.
+    // One of the hundred frames has depth: no VSD, no AR, and the reasons state this.
     assert_eq!((found.ar, found.ar_vsd), (None, None));
     assert!(found.reasons["ar_vsd"].contains("99 of 100 images"), "{}", found.reasons["ar_vsd"]);
     assert!(found.reasons["ar"].contains("ar_vsd"));
@@ -57,7 +57,7 @@ fn lmo_ground_truth_scores_exactly_one() {
             estimates.push(Estimate { time: Some(0.5), rotation_as_written, ..estimate });
         }
     }
-    // Written to a file and read again: the file must not cost anything.
+    // Written to a file and read again, without any loss.
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("gt_lmo-test.csv");
     sixfold_bop::write_results(&path, &estimates).unwrap();
@@ -66,19 +66,20 @@ fn lmo_ground_truth_scores_exactly_one() {
     let options = EvalOptions::default();
     let found = evaluate(&dataset, &estimates, &targets, &options, &()).unwrap();
     assert_eq!((found.ar_mssd, found.ar_mspd), (Some(1.0), Some(1.0)));
-    // The published matrices are not quite rotations, the estimates are read back from the same numbers: no error at all.
+    // The published matrices are not exactly rotations, but the estimates are read back from the same numbers: no error
+    // at all.
     assert_eq!((found.add_auc, found.add_s_auc), (Some(1.0), Some(1.0)));
     assert!(found.add_s_recall.values().all(|v| *v == Some(1.0)), "{:?}", found.add_s_recall);
     assert_eq!(found.average_time_per_image, Some(0.5));
     let found = evaluate_detection(&dataset, &estimates, &targets, &options).unwrap();
     assert_eq!(found.ap, Some(1.0));
 
-    // The one frame with depth: VSD and AR exist and are one as well, whatever hides the objects.
+    // The one frame with depth: VSD and AR exist and are one as well, despite occlusion.
     let frame: Vec<Target> = targets.iter().copied().filter(|t| t.im_id == 3).collect();
     let found = evaluate(&dataset, &estimates, &frame, &options, &()).unwrap();
     assert_eq!((found.ar, found.ar_vsd), (Some(1.0), Some(1.0)), "{:?}", found.reasons);
 
-    // And an estimate five centimetres off scores less in every respect.
+    // An estimate with an error of five centimetres gets lower scores in every respect.
     let mut off = estimates.clone();
     for estimate in &mut off {
         let t = estimate.camera_from_object.translation() + Vec3::new(0.05, 0.0, 0.0);

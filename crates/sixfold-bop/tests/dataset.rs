@@ -1,4 +1,4 @@
-//! A dataset written by this crate, read back, scored with VSD, and broken in every way a user can break it.
+//! A dataset written by this crate, read back, scored with VSD, and broken in the ways in which a user can break it.
 
 use std::path::{Path, PathBuf};
 
@@ -185,7 +185,8 @@ fn only_the_surest_estimates_count_and_the_others_are_counted_as_left_out() {
     estimates.push(Estimate { im_id: 99, ..estimates[0] });
     let found = score(&dataset, &estimates);
     assert_eq!((found.ar_mssd, found.estimates, found.estimates_left_out), (Some(0.0), 4, 5));
-    // As detections the wrong ones cost precision, the right ones are still found: precision 1/2 at every recall.
+    // As detections, the wrong ones lower the precision and the right ones are still found: precision 1/2 at every
+    // recall.
     let targets = dataset.targets(None).unwrap();
     let found = evaluate_detection(&dataset, &estimates, &targets, &EvalOptions::default()).unwrap();
     assert!((found.ap.unwrap() - 0.5).abs() < 1e-12, "{found:?}");
@@ -194,7 +195,7 @@ fn only_the_surest_estimates_count_and_the_others_are_counted_as_left_out() {
 #[test]
 fn vsd_of_a_shift_along_the_axis_is_between_the_taus() {
     // 26 mm towards the camera at a diameter of 123 mm is 0.21 diameters: wrong for the taus up to .2, and right for
-    // those above but for the pixels at the silhouette, which a wide threshold forgives.
+    // those above, except for the pixels at the silhouette, which a wide threshold tolerates.
     let (_dir, dataset) = written();
     let mut estimates = truth_as_estimates(&dataset);
     for e in &mut estimates {
@@ -219,7 +220,7 @@ fn missing_parts_leave_scores_empty_with_reasons() {
     assert!(found.reasons["ar_vsd"].contains("1 of 2 images"), "{:?}", found.reasons);
     assert!(found.reasons["ar_mssd"].contains("no model of object 2"), "{:?}", found.reasons);
     assert_eq!((found.add_s_recall["1"], found.add_s_recall["2"]), (Some(1.0), None));
-    // Of frame 3 and object 1 alone everything can be computed.
+    // For frame 3 and object 1 alone everything can be computed.
     let object = Some(TargetObject { obj_id: 1, inst_count: 1 });
     let one = [Target { scene_id: 2, im_id: 3, object }];
     let found =
@@ -238,7 +239,7 @@ fn poses_that_are_hardly_visible_are_no_targets_of_their_own_accord() {
     std::fs::write(&path, info.to_string()).unwrap();
     let dataset = BopDataset::open(dir.path(), "test").unwrap();
     assert_eq!(dataset.targets(None).unwrap().len(), 3);
-    // As a detection the hardly visible one is neither missed nor false.
+    // As a detection, the hardly visible one is ignored.
     let images: Vec<Target> = [3, 11].map(|im_id| Target { scene_id: 2, im_id, object: None }).to_vec();
     let mut estimates = truth_as_estimates(&dataset);
     let options = EvalOptions::default();
@@ -272,7 +273,7 @@ fn broken_datasets_are_named() {
     for part in ["000003.png", "im_id 3", "320x240", "160x120", "camera.json", "another resolution"] {
         assert!(error.contains(part), "{error} lacks {part}");
     }
-    // A depth image that is cut off.
+    // A truncated depth image.
     let png = std::fs::read(file("depth/000003.png")).unwrap();
     std::fs::write(file("depth/000003.png"), &png[..png.len() / 2]).unwrap();
     assert!(message(scene.depth(3)).contains("depth/000003.png: im_id 3: not a readable image"));

@@ -1,5 +1,5 @@
-//! Datasets of other formats, read by the file that their authors' scripts write (`fixtures/import/make.py`), converted and read
-//! again as BOP datasets.
+//! Datasets of other formats, from files as their authors' scripts write them (`fixtures/import/make.py`), converted and read again
+//! as BOP datasets.
 
 use std::path::{Path, PathBuf};
 
@@ -21,7 +21,7 @@ fn fixture(name: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fixtures/import").join(name)
 }
 
-/// A box of 10x8x6 cm with a corner in the origin.
+/// A box of 10x8x6 cm with a corner at the origin.
 fn cuboid() -> Mesh {
     let corner = |i: u32| {
         Vec3::new(0.1 * f64::from(i >> 2 & 1), 0.08 * f64::from(i >> 1 & 1), 0.06 * f64::from(i & 1))
@@ -35,7 +35,7 @@ fn camera() -> Camera {
     Camera::new(60.0, 62.0, 31.5, 23.5, 64, 48).unwrap()
 }
 
-/// What the meta files say: a quarter turn about z in OpenGL's frame, whose y and z are the negative of ours.
+/// The pose in the meta files: a rotation by 90 degrees about z in OpenGL's frame, whose y and z are the negative of ours.
 fn ho3d_pose() -> Pose {
     let rotation = UnitQuaternion::from_euler_angles(std::f64::consts::PI, 0.0, 0.0)
         * UnitQuaternion::from_euler_angles(0.0, 0.0, std::f64::consts::FRAC_PI_2);
@@ -50,7 +50,7 @@ fn ho3d(metas: &[&str], edit: impl Fn(Vec<u8>) -> Vec<u8>) -> TempDir {
         std::fs::create_dir_all(sequence.join(folder)).unwrap();
     }
     let depth = render_depth(&cuboid(), &ho3d_pose(), &camera());
-    // A hand over the left part, as far away as a third of a metre.
+    // A hand over the left part, at a distance of 0.3 m.
     let depth = DepthImage::from_fn(64, 48, |x, y| if x < 28 { 0.3 } else { depth[(x, y)] });
     let spread = |x: usize, y: usize| {
         let units = (f64::from(depth[(x, y)]) / HO3D_UNIT).round() as u32;
@@ -108,7 +108,7 @@ fn ho3d_says_the_same_in_every_protocol_of_pickle() {
         let c = scene.camera(im_id).unwrap();
         assert_eq!((c.fx, c.fy, c.cx, c.cy, c.width, c.height), (60.0, 62.0, 31.5, 23.5, 64, 48));
         assert_eq!(scene.rgb(im_id).unwrap().unwrap()[(5, 5)], [im_id as u8; 3]);
-        // Depth comes back to half a unit, and what the hand covers is not visible.
+        // Depth is accurate to half a unit, and the part covered by the hand is not visible.
         let depth = scene.depth(im_id).unwrap().unwrap();
         assert!((f64::from(depth[(3, 3)]) - 0.3).abs() < HO3D_UNIT, "{}", depth[(3, 3)]);
         let visible = scene.mask(im_id, 0, MaskKind::Visible).unwrap().unwrap();
@@ -157,7 +157,7 @@ fn what_is_wrong_with_a_meta_file_is_named() {
         (convert(&swapped(b"003_cracker_box", b"xxx_cracker_box")), ["field objName", "003_cracker_box"]),
         (convert(&swapped(b"003_cracker_box", b"../../../../../")), ["field objName", "YCB"]),
         (convert(&swapped(b"003_cracker_box", b"004_cracker_box")), ["004_cracker_box", "YCB-Video"]),
-        // A matrix of one number fewer: as many bytes have to be there as the shape says.
+        // A matrix with one number fewer: the number of bytes has to match the shape.
         (convert(&swapped(b"K\x03K\x03\x86", b"K\x03K\x02\x86")), ["bytes for an array", "as many"]),
     ] {
         assert!(parts.iter().all(|part| error.contains(part)), "{error}: {parts:?}");
@@ -199,7 +199,7 @@ fn nol_sources_have_the_camera_of_their_part() {
     let named = NolOptions { obj_id: Some(3), ..options.clone() };
     let summary = import_nol(&fixture("nol_obj_07.hdf5"), &dir.path().join("three"), &named, &()).unwrap();
     assert!(summary.objects.contains(&3));
-    // Files that are not of this form.
+    // Files that do not have this form.
     let fails = |file: &Path, parts: &[&str]| {
         let error = import_nol(file, &dir.path().join("none"), &options, &()).unwrap_err().to_string();
         assert!(parts.iter().all(|part| error.contains(part)), "{error}: {parts:?}");
@@ -256,7 +256,7 @@ fn smot_is_in_metres_there_and_in_millimetres_here() {
             < 1e-12
     );
     assert_eq!(of(0).info.as_ref().unwrap()[0].visib_fract, 1.0);
-    // What is measured lies 20 cm before the second pose, all over it.
+    // The measured depth is 20 cm in front of the second pose everywhere.
     assert_eq!(of(2).info.as_ref().unwrap()[0].visib_fract, 0.0);
     let depth = scene.depth(0).unwrap().unwrap();
     assert!((depth[(32, 24)] - 0.6).abs() < 5e-4, "{}", depth[(32, 24)]);
@@ -290,7 +290,7 @@ fn what_is_wrong_with_smot_is_named() {
 
 #[test]
 fn no_bytes_make_the_readers_panic() {
-    // Every single byte of the files changed in three ways, and every length that they may be cut to.
+    // Every byte of the files is changed in three ways, and the files are truncated to every length.
     let names = ["vertices_3d", "faces", "images", "poses", "masks", "bboxes"];
     let mut read = 0;
     for name in METAS.iter().chain(&["nol_obj_07.hdf5", "chunked.hdf5", "newest.hdf5"]) {
@@ -318,7 +318,7 @@ fn no_bytes_make_the_readers_panic() {
 
 #[test]
 fn a_pickle_that_uses_its_bytes_again_and_again_is_refused() {
-    // One array of 60 kB, made from the same bytes by every three of the following bytes.
+    // An array of 60 kB, made again from the same bytes by every three of the following bytes.
     let mut bytes = b"\x80\x04}\x94cnumpy.core.numeric\n_frombuffer\n\x94".to_vec();
     bytes.extend(b"B");
     bytes.extend(60_000u32.to_le_bytes());

@@ -1,5 +1,5 @@
-//! The cameras of real datasets all pass what refuses impossible ones: those of the sample frames, and of the datasets that are at
-//! hand.
+//! The cameras of real datasets all pass the checks that refuse impossible ones: those of the sample frames, and of the available
+//! datasets.
 
 mod support;
 

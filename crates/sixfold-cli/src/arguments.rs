@@ -1,4 +1,4 @@
-//! The command line, defined once: parsing, `--help` and completions all come from here.
+//! The command line, defined once for parsing, `--help` and completions.
 
 use std::num::NonZeroUsize;
 

@@ -1,9 +1,9 @@
-//! The options of this program that would be ignored beside others, and are refused.
+//! Options of this program that would have no effect in combination with others, and are refused.
 
 use sixfold_shell::idle::Idle;
 use sixfold_shell::idle::When::{Is, IsNot, With, Without};
 
-/// One line for each reason.
+/// One entry for each reason.
 #[rustfmt::skip]
 pub(crate) const IDLE: &[Idle] = &[
     Idle { command: "estimate", options: &["unit", "store", "instances"], when: &[With("dataset")] },

@@ -2,7 +2,7 @@
 //!
 //! Exit status: 0 found, 1 nothing found, 2 error.
 
-// What is printed goes through `sixfold_shell::screen`: its macros take the place of the standard ones.
+// All output goes through `sixfold_shell::screen`, whose macros replace the standard ones.
 #[macro_use]
 extern crate sixfold_shell;
 

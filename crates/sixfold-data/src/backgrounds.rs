@@ -1,4 +1,4 @@
-//! What training images show behind their objects.
+//! The backgrounds of training images.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -9,7 +9,7 @@ use sixfold_synth::augment::{AugmentError, Backgrounds, PhotographOptions};
 use crate::posed_image::PosedImage;
 use crate::training_set::TrainingObject;
 
-/// Photographs of a folder if there is one, else procedural textures; and the fraction of textures that goes well with them.
+/// The photographs of a folder if one is given, else procedural textures; and the suitable fraction of textures.
 ///
 /// # Errors
 /// [`AugmentError`] for a folder without photographs.
@@ -28,7 +28,7 @@ pub fn background_files(folder: Option<&Path>) -> Result<Vec<PathBuf>, AugmentEr
     folder.map_or(Ok(vec![]), |folder| Backgrounds::files(folder, &PhotographOptions::default()))
 }
 
-/// As [`plain_backgrounds`], and always the training images themselves away from their objects.
+/// As [`plain_backgrounds`], with additional backgrounds from the training images themselves, away from their objects.
 ///
 /// # Errors
 /// [`AugmentError`].

@@ -1,8 +1,9 @@
-//! Changes of colour that stand for cameras and lamps that the training images do not show.
+//! Colour augmentation that imitates cameras and lamps missing from the training images.
 
 use sixfold_synth::augment::ColorAugmentation;
 
-/// For finished training images: [`ColorAugmentation::real_images`] with strong contrast more often and of a wider range.
+/// For finished training images: [`ColorAugmentation::real_images`] with strong contrast more often and over a wider
+/// range.
 pub fn image_color_augmentation() -> ColorAugmentation {
     ColorAugmentation {
         strong_contrast_probability: 0.4,

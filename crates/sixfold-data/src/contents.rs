@@ -1,5 +1,5 @@
-//! What a training set holds, in a few words and hashes: the same for the same pixels, poses and meshes wherever they lie, another as
-//! soon as one of them is.
+//! A summary of a training set in words and hashes: equal for equal pixels, poses and meshes in whatever files they are, different
+//! as soon as one of them differs.
 
 use std::sync::Arc;
 
@@ -9,11 +9,11 @@ use sixfold_io::Fnv1a;
 use crate::posed_image::PosedImage;
 use crate::training_set::{TrainingObject, TrainingSet};
 
-/// Frames that are named one by one.
+/// Up to this many frames are named one by one.
 const NAMED: usize = 8;
 
 impl TrainingSet {
-    /// Names and contents of what is learnt from: ids and frames in words, each object (its mesh, diameter and symmetries) and all
+    /// Names and contents of the training data: ids and frames in words; each object (its mesh, diameter and symmetries) and all
     /// images (pixels, cameras, poses and masks) as hashes.
     pub fn contents(&self) -> Vec<(String, String)> {
         let ids: Vec<String> = self.objects.iter().map(|o| o.id.to_string()).collect();
@@ -82,7 +82,7 @@ fn hash_of_images(images: &[PosedImage]) -> u64 {
     all.0.value()
 }
 
-/// Takes in values as their bytes.
+/// Hashes values by their bytes.
 #[derive(Default)]
 struct Hash(Fnv1a);
 
@@ -151,7 +151,7 @@ mod tests {
         }
     }
 
-    /// The names of what differs from the set as it is.
+    /// The names of the entries that a change of the set changes.
     fn changed(by: impl FnOnce(&mut TrainingSet)) -> Vec<String> {
         let mut other = set();
         by(&mut other);

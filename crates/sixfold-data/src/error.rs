@@ -1,4 +1,4 @@
-//! What can be wrong with posed images and training sets.
+//! Errors of posed images and training sets.
 
 use std::path::PathBuf;
 
@@ -9,7 +9,7 @@ use sixfold_mesh::MeshFileError;
 use sixfold_synth::augment::AugmentError;
 use thiserror::Error;
 
-/// What is wrong with one posed image.
+/// An error of one posed image.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum PosedImageError {
@@ -49,7 +49,7 @@ pub enum PosedImageError {
         /// Translation of the pose, metres.
         translation: [f64; 3],
     },
-    /// Too little of the object is seen to learn from.
+    /// Too little of the object is visible to learn from.
     #[error(
         "photograph {name}: its mask holds {pixels} pixels of the object, expected at least {least}; leave this image out or check its pose"
     )]
@@ -58,10 +58,10 @@ pub enum PosedImageError {
         name: String,
         /// Visible pixels.
         pixels: usize,
-        /// How many there should be.
+        /// The minimum number.
         least: usize,
     },
-    /// Nothing says where the object is visible.
+    /// It is unknown where the object is visible.
     #[error("photograph {name}: no mask says where the object is visible; give its mask")]
     NoMask {
         /// The image.
@@ -85,7 +85,7 @@ pub enum TrainingSetError {
     /// An image file cannot be read.
     #[error(transparent)]
     ImageFile(#[from] ImageFileError),
-    /// A camera file cannot be read, or is not of the image.
+    /// A camera file cannot be read, or does not belong to the image.
     #[error(transparent)]
     CameraFile(#[from] CameraFileError),
     /// An image does not belong to its camera.
@@ -94,7 +94,7 @@ pub enum TrainingSetError {
     /// The detector cannot search an image.
     #[error("detector: {0}")]
     Detector(Box<dyn std::error::Error + Send + Sync>),
-    /// A file that names photographs is broken.
+    /// A file that lists photographs is invalid.
     #[error("{}: {reason}", path.display())]
     Photographs {
         /// The file.
@@ -111,13 +111,13 @@ pub enum TrainingSetError {
     /// The backgrounds cannot be read.
     #[error(transparent)]
     Backgrounds(#[from] AugmentError),
-    /// The dataset does not say which objects it has.
+    /// The dataset does not list its objects.
     #[error("{}: no objects: its models have no models_info.json; name their ids", root.display())]
     NoObjects {
         /// The dataset.
         root: PathBuf,
     },
-    /// An object is named twice: a model would have it twice.
+    /// An object is named twice, so a model would contain it twice.
     #[error("ids: object {id} is named more than once; name every object once")]
     NamedTwice {
         /// The object.
@@ -141,7 +141,7 @@ pub enum TrainingSetError {
         root: PathBuf,
         /// How many there are.
         frames: usize,
-        /// How much should be seen.
+        /// The minimum visible part.
         percent: f64,
     },
 }

@@ -1,7 +1,8 @@
-//! What methods learn from: posed images, training sets read from BOP datasets or made of meshes, and the drawing of
-//! training objects at random poses under random light. Nothing here knows a network.
+//! Training data: posed images, training sets read from BOP datasets or made of meshes, and renderings of training
+//! objects at random poses under random light. Nothing here depends on a network.
 //!
-//! [`TrainingSet::of_dataset`] reads objects and [`PosedImage`]s; [`PoseRange`] draws poses, [`color_patch`] images.
+//! [`TrainingSet::of_dataset`] reads objects and [`PosedImage`]s; [`PoseRange`] samples poses, [`color_patch`]
+//! renders images.
 
 #![warn(unreachable_pub, unnameable_types)]
 

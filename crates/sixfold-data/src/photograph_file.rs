@@ -1,4 +1,4 @@
-//! A file that names a mesh and photographs of it: JSON, poses as BOP has them, paths relative to the file.
+//! A file that lists a mesh and photographs of it: JSON, poses in BOP's form, paths relative to the file.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -15,7 +15,8 @@ use crate::rough_images::{
     Disturber, RoughImage, RoughImageOptions, RoughImages, RoughObject, detected_mask, detections,
 };
 
-/// A file that lists photographs of one object with its pose in each, and its mesh if there is one. Paths are relative to the file.
+/// A file that lists photographs of one object with its pose in each, and its mesh, if there is one. Paths are relative to the
+/// file.
 #[derive(Debug, Clone, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PhotographFile {
@@ -25,8 +26,8 @@ pub struct PhotographFile {
     /// Unit of the mesh file: m, cm, mm, in.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub unit: Option<String>,
-    /// The plane on which the object stands, in the object's frame: nothing of the object is below. Without a point the highest plane
-    /// that the masks allow.
+    /// The plane on which the object stands, in the object's frame: nothing of the object is below it. Without a point, the highest
+    /// plane that the masks allow is used.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub floor: Option<FloorEntry>,
     /// The photographs.
@@ -39,13 +40,13 @@ pub struct PhotographFile {
 pub struct FloorEntry {
     /// Its normal, upwards; of any length but 0.
     pub normal: [f64; 3],
-    /// A point of it, millimetres.
+    /// A point on it, millimetres.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub point: Option<[f64; 3]>,
 }
 
 impl FloorEntry {
-    /// The normal, of length 1; `None` where it has no direction or a number is not finite.
+    /// The normal, of length 1; `None` if its length is 0 or a number is not finite.
     pub fn up(&self) -> Option<Vec3> {
         let normal = Vec3::from(self.normal).try_normalize(1e-12)?;
         normal.iter().all(|v| v.is_finite()).then_some(normal)
@@ -71,7 +72,7 @@ pub struct PhotographEntry {
     pub cam_R_m2c: [f64; 9],
     /// Translation of the same, millimetres.
     pub cam_t_m2c: [f64; 3],
-    /// Where the object is seen, of the image without lens distortion: PNG, 0 outside; 128 where something may hide the object.
+    /// Mask of the object in the image without lens distortion: PNG, 0 outside; 128 where something may occlude the object.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub mask: Option<String>,
     /// Measured depth from the same pixels: PNG of 16 bits.
@@ -116,7 +117,7 @@ impl PhotographFile {
         Ok(file)
     }
 
-    /// The mesh, metres; `None` where the file names none.
+    /// The mesh, metres; `None` if the file names none.
     ///
     /// # Errors
     /// [`TrainingSetError`].
@@ -134,14 +135,14 @@ impl PhotographEntry {
     /// Takes points of the object's frame to the camera's.
     ///
     /// # Errors
-    /// [`PoseError`] where the matrix is no rotation.
+    /// [`PoseError`] if the matrix is not a rotation.
     pub fn pose(&self) -> Result<Pose, PoseError> {
         Pose::from_parts(&Mat3::from_row_slice(&self.cam_R_m2c), Vec3::from(self.cam_t_m2c) * 1e-3)
     }
 }
 
 impl RoughImages {
-    /// The mesh and the photographs that a file names; the object gets the id 1. `detected` is its id for the detector.
+    /// The mesh and the photographs that a file lists; the object gets the id 1. `detected` is its id for the detector.
     ///
     /// # Errors
     /// [`TrainingSetError`].
@@ -179,7 +180,7 @@ impl RoughImages {
     }
 }
 
-/// The mask that a detector sees where the pose puts the object.
+/// The detector's mask at the position of the object according to its pose.
 fn mask_of_detector(
     options: &RoughImageOptions<'_>,
     image: &RgbImage,

@@ -1,4 +1,4 @@
-//! One object in one image with known camera and pose: what methods learn from and what a user photographs.
+//! One object in one image with known camera and pose, from a training set or from a user's photographs.
 
 use std::sync::Arc;
 
@@ -8,11 +8,11 @@ use sixfold_synth::augment::{AffineMap, Coverage, Cutout};
 use crate::error::PosedImageError;
 use crate::visible_mask::VisibleMask;
 
-/// Fewer visible pixels add nothing.
+/// Minimum number of visible pixels: fewer add no information.
 pub const MIN_PIXELS: usize = 64;
 
-/// One object in one image: pinhole camera, pose, and where the object is visible, if that is known. The image is shared
-/// between its objects.
+/// One object in one image: pinhole camera, pose, and the mask of the visible object, if known. The image is shared between
+/// its objects.
 #[derive(Debug, Clone)]
 pub struct PosedImage {
     name: String,
@@ -26,8 +26,8 @@ pub struct PosedImage {
 }
 
 impl PosedImage {
-    /// One object in an image by a pinhole camera. `name` stands for it in messages. Without [`PosedImage::with_mask`] nothing
-    /// is known of what hides the object.
+    /// One object in an image of a pinhole camera. `name` is its name in messages. Without [`PosedImage::with_mask`],
+    /// occlusion of the object is unknown.
     ///
     /// # Errors
     /// [`PosedImageError::Camera`], [`PosedImageError::Size`], [`PosedImageError::OutsideImage`].
@@ -85,7 +85,7 @@ impl PosedImage {
     fn check_pose(&self, pose: &Pose) -> Result<(), PosedImageError> {
         let t = pose.translation();
         let (w, h) = (self.camera.width as f64, self.camera.height as f64);
-        // The origin may lie a little outside the image while the object is inside; behind the camera it may not.
+        // The object's origin may be somewhat outside the image while the object is inside, but not behind the camera.
         let near = |p: Vec2| p.x > -w && p.y > -h && p.x < 2.0 * w && p.y < 2.0 * h;
         if t.iter().all(|v| v.is_finite()) && t.z > 0.01 && self.camera.project(&t).is_some_and(near) {
             return Ok(());
@@ -102,7 +102,7 @@ impl PosedImage {
         Ok(PosedImage { mask: Some(VisibleMask::new(mask)), ..self })
     }
 
-    /// The same, knowing which part of the object's silhouette is visible, 0 to 1.
+    /// The same with the visible fraction of the object's silhouette, 0 to 1.
     pub(crate) fn with_visible_fraction(self, fraction: f64) -> Self {
         PosedImage { visible_fraction: Some(fraction), ..self }
     }
@@ -135,12 +135,12 @@ impl PosedImage {
         &self.name
     }
 
-    /// Which image of a dataset it is, if it is of one.
+    /// The frame of a dataset, if the image is from one.
     pub fn frame(&self) -> Option<FrameId> {
         self.frame
     }
 
-    /// Which object.
+    /// Id of the object.
     pub fn object_id(&self) -> u32 {
         self.object_id
     }
@@ -160,12 +160,12 @@ impl PosedImage {
         &self.camera_from_object
     }
 
-    /// Where the object is visible, if that is known.
+    /// The mask of the visible object, if known.
     pub fn mask(&self) -> Option<&VisibleMask> {
         self.mask.as_ref()
     }
 
-    /// Which part of the object's silhouette is visible, 0 to 1, if that is known.
+    /// The visible fraction of the object's silhouette, 0 to 1, if known.
     pub fn visible_fraction(&self) -> Option<f64> {
         self.visible_fraction
     }
@@ -175,12 +175,12 @@ impl PosedImage {
         self.mask.as_ref().map(VisibleMask::bounding_box)
     }
 
-    /// Points of the image whose box is that of the visible part, however the image is rotated; none without a mask.
+    /// Points of the image whose bounding box is that of the visible part for any rotation of the image; empty without a mask.
     pub fn outline(&self) -> &[Vec2] {
         self.mask.as_ref().map_or(&[], VisibleMask::outline)
     }
 
-    /// How much of each pixel of a crop shows the object; nothing without a mask.
+    /// The fraction of each pixel of a crop that shows the object; 0 without a mask.
     pub fn visible(&self, map: &AffineMap, size: usize) -> Coverage {
         Coverage::from_fn(size, size, |x, y| {
             let [u, v] = map.apply(x as f32, y as f32);
@@ -188,7 +188,7 @@ impl PosedImage {
         })
     }
 
-    /// The visible part as an image of its own; `None` where nothing is visible.
+    /// The visible part as a separate image; `None` if nothing is visible.
     pub fn cutout(&self) -> Option<Cutout> {
         let mask = self.mask.as_ref()?;
         let area = mask.bounding_box();
@@ -223,7 +223,7 @@ mod tests {
         assert!(empty.cutout().is_none());
         let text = with(&Mask::filled(3, 3, true)).unwrap_err().to_string();
         assert!(text.contains("first.png: the mask is 3x3, the camera says 320x240"), "{text}");
-        // Behind the camera, far aside, not a number; a little aside is no error.
+        // Behind the camera, far outside the image, not a number; slightly outside is no error.
         for place in [[0.0, 0.0, -0.6], [9.0, 0.0, 0.6], [0.0, f64::NAN, 0.6]] {
             let text = make(Pose::from_translation(place.into())).unwrap_err().to_string();
             assert!(text.contains("outside the image"), "{text}");

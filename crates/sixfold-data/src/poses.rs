@@ -1,4 +1,4 @@
-//! Poses of rendered objects: near those of posed images, or from anywhere on a part of the view sphere.
+//! Poses of rendered objects: near those of posed images, or anywhere on a part of the view sphere.
 
 use rand::RngExt;
 use sixfold_geometry::nalgebra::{Rotation3, UnitQuaternion};
@@ -7,14 +7,15 @@ use sixfold_geometry::{Camera, Mat3, Pose, Vec2, Vec3};
 
 use crate::posed_image::PosedImage;
 
-/// The camera of renders where nobody gives one.
+/// The default camera of renders.
 pub const DEFAULT_CAMERA: Camera =
     Camera { fx: 600.0, fy: 600.0, cx: 319.5, cy: 239.5, width: 640, height: 480, distortion: None };
 
 /// How poses of renders vary. The defaults are for objects on a table, seen from above.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PoseVariation {
-    /// Fraction of poses near one of a posed image, 0..1; the others look from anywhere within `elevation`.
+    /// Fraction of poses near one of a posed image, 0..1; the others view the object from anywhere within
+    /// `elevation`.
     pub near_fraction: f32,
     /// Largest rotation about each axis away from a posed image's pose, radians.
     pub noise: f64,
@@ -45,12 +46,12 @@ pub fn distances<'a>(images: impl IntoIterator<Item = &'a PosedImage>) -> Option
     (low <= high).then_some([0.9 * low, 1.1 * high])
 }
 
-/// Distances where no image tells them: 4 to 12 diameters.
+/// Distances without images: 4 to 12 diameters.
 pub fn default_distances(diameter: f64) -> [f64; 2] {
     [4.0 * diameter, 12.0 * diameter]
 }
 
-/// What poses are sampled from.
+/// The range from which poses are sampled.
 pub struct PoseRange<'a> {
     /// The camera.
     pub camera: &'a Camera,
@@ -58,26 +59,26 @@ pub struct PoseRange<'a> {
     pub centre: Vec3,
     /// Distances of that centre from the camera, metres.
     pub distance: [f64; 2],
-    /// Poses of posed images, possibly none.
+    /// Poses of posed images; may be empty.
     pub real: &'a [Pose],
 }
 
 impl PoseRange<'_> {
-    /// A pose: near one of the posed images or from anywhere, as the variation says.
+    /// Samples a pose: near one of the posed images or anywhere, according to the variation.
     pub fn draw(&self, variation: &PoseVariation, random: &mut Random) -> Pose {
         let near = !self.real.is_empty() && random.random::<f32>() < variation.near_fraction;
         let facing = if near {
             let pose = &self.real[random.random_range(0..self.real.len())];
             let noise = Vec3::from_fn(|_, _| variation.noise * (2.0 * random.random::<f64>() - 1.0));
             let turn = f64::from(uniform(random, [-variation.rotation, variation.rotation]));
-            // As it looks when the camera points at it.
+            // The pose when the camera points at the object.
             let ray = pose.transform_point(&self.centre);
             let view = towards(&ray).inverse() * pose.rotation();
             turn_in_plane(turn) * UnitQuaternion::from_scaled_axis(noise) * view
         } else {
             anywhere(variation, random)
         };
-        // Anywhere in the image but its rim, seen along that ray.
+        // Any pixel except near the border; the object is viewed along its ray.
         let pixel = Vec2::new(
             self.camera.width as f64 * (0.1 + 0.8 * random.random::<f64>()),
             self.camera.height as f64 * (0.1 + 0.8 * random.random::<f64>()),
@@ -105,7 +106,7 @@ fn turn_in_plane(angle: f64) -> UnitQuaternion<f64> {
     UnitQuaternion::from_axis_angle(&Vec3::z_axis(), angle)
 }
 
-/// The smallest turn that brings the camera's axis to `ray`.
+/// The smallest rotation that takes the camera's axis to `ray`.
 fn towards(ray: &Vec3) -> UnitQuaternion<f64> {
     UnitQuaternion::rotation_between(&Vec3::z(), ray).unwrap_or_else(UnitQuaternion::identity)
 }
@@ -114,7 +115,7 @@ fn towards(ray: &Vec3) -> UnitQuaternion<f64> {
 /// the object's z axis points up.
 fn looking_from(direction: &Vec3, azimuth: f64) -> UnitQuaternion<f64> {
     let z = -direction;
-    // Seen from right above, "right" still follows the azimuth.
+    // From straight above, the image's x axis still follows the azimuth.
     let x = Vec3::new(-azimuth.sin(), azimuth.cos(), 0.0);
     let y = z.cross(&x);
     let rows = Mat3::from_rows(&[x.transpose(), y.transpose(), z.transpose()]);

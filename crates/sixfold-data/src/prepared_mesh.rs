@@ -1,28 +1,28 @@
-//! A mesh made ready to be rendered thousands of times: few faces, normals at hand, and what its box in an image needs.
+//! A mesh prepared to be rendered thousands of times: few faces, normals, and the vertices that determine its box in an image.
 
 use sixfold_geometry::{Camera, Pose, Vec2, Vec3};
 use sixfold_mesh::{Mesh, simplify};
 
-/// A training object's mesh made ready.
+/// The prepared mesh of a training object.
 #[derive(Debug, Clone)]
 pub struct PreparedMesh {
-    /// The simplified mesh with its normals; a simplified mesh has lost its texture.
+    /// The simplified mesh with its normals; simplification removes the texture.
     pub mesh: Mesh,
-    /// Whether the mesh that was given has faces with colours or texture of their own.
+    /// Whether the original mesh has faces with colours or a texture.
     pub colored: bool,
     /// Centre of its box, object frame, metres.
     pub centre: Vec3,
-    /// Vertices that decide about the object's box from any side.
+    /// Vertices that determine the object's box from any side.
     extremes: Vec<Vec3>,
 }
 
-/// Whether a mesh has a texture and says where on it.
+/// Whether a mesh has a texture and texture coordinates.
 pub fn is_textured(mesh: &Mesh) -> bool {
     mesh.texture().is_some() && mesh.texcoords().is_some()
 }
 
 impl PreparedMesh {
-    /// Simplifies a mesh of more than `faces` faces; `extremes` directions decide about its box in images.
+    /// Simplifies a mesh of more than `faces` faces; `extremes` directions determine its box in images.
     pub fn new(mesh: &Mesh, faces: usize, extremes: usize) -> Self {
         let (low, high) = mesh.bounding_box();
         let colored = (is_textured(mesh) || mesh.colors().is_some()) && !mesh.faces().is_empty();

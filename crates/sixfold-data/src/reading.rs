@@ -1,4 +1,4 @@
-//! Posed images of a BOP dataset: masks from its files, or drawn from its annotations where there are none.
+//! Posed images of a BOP dataset: masks from its files, or rendered from its annotations where there are none.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
@@ -10,11 +10,11 @@ use sixfold_mesh::Mesh;
 use crate::error::TrainingSetError;
 use crate::posed_image::{MIN_PIXELS, PosedImage};
 
-/// Reads the images of a dataset that show `objects`, one posed image for each instance; nothing but `frames` is opened.
+/// Reads the images of a dataset that show `objects`, one posed image for each instance; only `frames` are opened.
 /// Instances less visible than `min_visibility` (0..1), or with fewer than [`MIN_PIXELS`] visible pixels, are left out.
 ///
 /// Visible masks come from the dataset (`mask_visib`); where a frame has none, all its annotated objects are rendered
-/// together. What is annotated nowhere and hides an object is then not known.
+/// together. Occluders that are not annotated are then unknown.
 ///
 /// # Errors
 /// [`TrainingSetError`] when the dataset or one of the frames cannot be read.

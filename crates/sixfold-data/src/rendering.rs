@@ -1,4 +1,4 @@
-//! Drawing an object: its colours under random light.
+//! Rendering of an object: its colours under random light.
 
 use rand::RngExt;
 use sixfold_geometry::random::{Random, uniform};
@@ -36,7 +36,7 @@ pub fn color_patch(
     (Patch::from_rgb(&image), silhouette)
 }
 
-/// Light from everywhere and one to three lamps on the camera's side.
+/// Ambient light and one to three lamps on the camera's side.
 pub fn random_lights(random: &mut Random) -> Vec<Light> {
     let tint = |strength: f32, random: &mut Random| -> [f32; 3] {
         std::array::from_fn(|_| strength * uniform(random, [0.9, 1.1]))
@@ -46,7 +46,7 @@ pub fn random_lights(random: &mut Random) -> Vec<Light> {
     let lamps = random.random_range(1..4u32);
     for _ in 0..lamps {
         let strength = uniform(random, [0.1, 0.9]) / lamps as f32;
-        // Travels away from the camera and, more often than not, down.
+        // The light travels away from the camera and usually down.
         let direction = Vec3::new(
             f64::from(uniform(random, [-1.0, 1.0])),
             f64::from(uniform(random, [-0.5, 1.3])),
@@ -57,7 +57,7 @@ pub fn random_lights(random: &mut Random) -> Vec<Light> {
     lights
 }
 
-/// A surface that is matt more often than shiny, its own colour random where the mesh has none.
+/// A surface that is matt more often than shiny; its colour is random if the mesh has none.
 pub fn random_material(random: &mut Random) -> Material {
     let shiny = random.random::<f32>() < 0.4;
     Material {

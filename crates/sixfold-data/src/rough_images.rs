@@ -1,8 +1,8 @@
-//! Posed images whose poses are rough, as who takes photographs gives them: of a dataset's frames, or of a file that names
-//! them (`photograph_file.rs`).
+//! Posed images with approximate poses, as from a user's photographs: frames of a dataset, or images listed in a file
+//! (`photograph_file.rs`).
 //!
-//! Masks are the dataset's or those of a detector. Where there are none they are rendered from the poses, and again when the
-//! poses are better.
+//! Masks come from the dataset or from a detector. Without these they are rendered from the poses, and rendered again when the
+//! poses have been refined.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -21,23 +21,24 @@ use sixfold_mesh::{Mesh, ModelInfo};
 use crate::error::TrainingSetError;
 use crate::posed_image::PosedImage;
 
-/// A detection is that of a posed object where its mask and the pose's silhouette overlap by this much (intersection over union).
+/// A detection belongs to a posed object if its mask and the silhouette at the pose overlap by at least this much (intersection
+/// over union).
 const SAME_OBJECT: f64 = 0.3;
 
-/// What sees masks in an image: its detections, best first.
+/// A function that detects masks in an image: its detections, best first.
 pub type DetectMasks<'a> =
     &'a dyn Fn(&RgbImage) -> Result<Vec<Detection>, Box<dyn std::error::Error + Send + Sync>>;
 
-/// How rough posed images are read.
+/// Options for reading approximately posed images.
 #[derive(Clone, Copy)]
 pub struct RoughImageOptions<'a> {
     /// Images that show less of an object than this fraction are left out.
     pub min_visibility: f64,
-    /// For experiments: poses are disturbed evenly by up to this much along and about each axis, metres and radians.
+    /// For experiments: poses are disturbed uniformly by up to this much along and about each axis, metres and radians.
     pub disturb: Option<[f64; 2]>,
     /// Seed of the disturbances.
     pub seed: u64,
-    /// Sees the masks where there are no others.
+    /// Detects the masks where there are no others.
     pub detect: Option<DetectMasks<'a>>,
 }
 
@@ -50,14 +51,14 @@ pub struct RoughObject {
     pub mesh: Mesh,
     /// Diameter and symmetries.
     pub info: ModelInfo,
-    /// Where it is seen.
+    /// The images that show it.
     pub images: Vec<RoughImage>,
 }
 
 /// One object in one image.
 #[derive(Debug)]
 pub struct RoughImage {
-    /// Number of the image; several objects are seen in one.
+    /// Number of the image, which may show several objects.
     pub number: usize,
     /// Image, camera, pose and mask.
     pub posed: PosedImage,
@@ -68,18 +69,18 @@ pub struct RoughImage {
 /// Camera, objects and poses of an image.
 type Posed = (Camera, Vec<(u32, Pose)>);
 
-/// Objects in roughly posed images.
+/// Objects in approximately posed images.
 #[derive(Debug, Default)]
 pub struct RoughImages {
-    /// The objects that are seen, by ascending id.
+    /// The visible objects, by ascending id.
     pub objects: Vec<RoughObject>,
-    /// What a user should know.
+    /// Notes for the user.
     pub notes: Vec<String>,
-    /// Objects that are not looked for but may hide others.
+    /// Objects that are not requested but may occlude others.
     others: BTreeMap<u32, Mesh>,
-    /// Every image some of whose masks were rendered from poses.
+    /// Every image with masks that were rendered from poses.
     rendered: BTreeMap<usize, Posed>,
-    /// Image and object of masks that were not.
+    /// Image and object of masks that were not rendered.
     kept: BTreeSet<(usize, u32)>,
 }
 
@@ -103,7 +104,7 @@ impl Disturber {
     }
 }
 
-/// What the detector sees in an image; nothing without one.
+/// The detections in an image; empty without a detector.
 pub(crate) fn detections(
     options: &RoughImageOptions<'_>,
     image: &RgbImage,
@@ -111,7 +112,7 @@ pub(crate) fn detections(
     options.detect.map_or(Ok(vec![]), |detect| detect(image).map_err(TrainingSetError::Detector))
 }
 
-/// The best mask of an object that lies where its silhouette is.
+/// The best detected mask of an object that overlaps its silhouette.
 pub(crate) fn detected_mask(all: &[Detection], id: u32, silhouette: &Mask) -> Option<Mask> {
     let silhouette = Rle::encode(silhouette).ok()?;
     let iou = |mask: &Rle| {
@@ -137,7 +138,7 @@ impl RoughImages {
         RoughImages::of_opened(&BopDataset::open(root, split)?, ids, frames, options)
     }
 
-    /// The same of an opened dataset, with the models that were chosen for it.
+    /// The same for an opened dataset, with its chosen models.
     ///
     /// # Errors
     /// [`TrainingSetError`].
@@ -171,12 +172,12 @@ impl RoughImages {
         Ok(all)
     }
 
-    /// One object, from wherever it is, with images that have masks or whose whole outline is taken.
+    /// One object from any source, with images that have masks or whose whole silhouettes are used.
     pub fn of_object(object: RoughObject) -> RoughImages {
         RoughImages { objects: vec![object], ..RoughImages::default() }
     }
 
-    /// Adds what a frame shows of the objects.
+    /// Adds the objects that a frame shows.
     fn add_frame(
         &mut self,
         dataset: &BopDataset,
@@ -221,7 +222,7 @@ impl RoughImages {
         Ok(())
     }
 
-    /// What is visible of everything in an image at these poses.
+    /// The visibility of all objects in an image at these poses.
     fn visibility(
         &self,
         objects: &BTreeMap<u32, RoughObject>,
@@ -235,7 +236,7 @@ impl RoughImages {
         ground_truth_visibility(&placed, camera, None, VISIBILITY_DELTA)
     }
 
-    /// Takes over the objects that are seen; the others may still hide them.
+    /// Keeps the objects that are visible; the others may still occlude them.
     fn leave_out_unseen(&mut self, objects: BTreeMap<u32, RoughObject>, frames: usize, min_visibility: f64) {
         let (seen, unseen): (Vec<RoughObject>, Vec<RoughObject>) =
             objects.into_values().partition(|o| !o.images.is_empty());
@@ -250,7 +251,7 @@ impl RoughImages {
         self.others.extend(unseen.into_iter().map(|o| (o.id, o.mesh)));
     }
 
-    /// Notes how many masks were not rendered from poses.
+    /// Adds a note on how many masks were not rendered from poses.
     fn note_masks(&mut self) {
         let all: usize = self.objects.iter().map(|o| o.images.len()).sum();
         let keys = self.objects.iter().flat_map(|o| o.images.iter().map(|i| (i.number, o.id)));
@@ -260,8 +261,7 @@ impl RoughImages {
         ));
     }
 
-    /// Renders the masks that came from poses again, now that the poses of the objects are better. `refined` has number of the
-    /// image, object and pose.
+    /// Renders the masks that came from poses again with refined poses. `refined` lists image number, object and pose.
     ///
     /// # Errors
     /// [`TrainingSetError`].
@@ -299,7 +299,7 @@ impl RoughImages {
     }
 }
 
-/// The dataset's mask; it fits the dataset's own poses, not disturbed ones.
+/// The dataset's mask, which fits the dataset's poses but not disturbed ones.
 fn own_mask(
     scene: &Scene,
     (im_id, index): (u32, usize),

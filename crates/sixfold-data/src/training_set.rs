@@ -1,4 +1,4 @@
-//! What trainings on objects learn from: images and models of a dataset, or meshes alone.
+//! The data of trainings on objects: images and models of a dataset, or meshes alone.
 
 use std::path::{Path, PathBuf};
 
@@ -11,7 +11,7 @@ use crate::error::TrainingSetError;
 use crate::posed_image::PosedImage;
 use crate::reading::read_posed_images;
 
-/// An object to be learnt.
+/// An object of a training.
 #[derive(Debug, Clone)]
 pub struct TrainingObject {
     /// Its id in the dataset.
@@ -20,7 +20,7 @@ pub struct TrainingObject {
     pub mesh: Mesh,
     /// Diameter and symmetries.
     pub info: ModelInfo,
-    /// How its coordinates are normalised.
+    /// The normalisation of its coordinates.
     pub scale: BoundingBoxScale,
 }
 
@@ -39,21 +39,21 @@ pub struct TrainingSet {
     pub objects: Vec<TrainingObject>,
     /// Images that show them, one entry for each instance.
     pub images: Vec<PosedImage>,
-    /// The frames of a dataset that were chosen, in order; none of these may be tested on.
+    /// The frames of a dataset that were chosen, in order; these must not be used for tests.
     pub frames: Vec<FrameId>,
-    /// Where objects and images came from, for people.
+    /// The source of objects and images, for people.
     pub description: String,
 }
 
-/// Which frames of a dataset's split are images to learn from.
+/// Which frames of a dataset's split are used as training images.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub enum FrameSelection {
-    /// All that have a colour image.
+    /// All frames with a colour image.
     #[default]
     All,
     /// None: no image is opened.
     RendersOnly,
-    /// Those that a file names: JSON, `[{"scene_id": 2, "im_id": 36}, ...]`.
+    /// The frames that a file lists: JSON, `[{"scene_id": 2, "im_id": 36}, ...]`.
     File(PathBuf),
     /// These.
     Listed(Vec<FrameId>),
@@ -61,7 +61,7 @@ pub enum FrameSelection {
 
 impl TrainingSet {
     /// Objects of a BOP dataset (all that its models_info.json names if `ids` is empty), and the instances in its
-    /// images of which at least the fraction `min_visibility` is seen.
+    /// images whose visible fraction is at least `min_visibility`.
     ///
     /// # Errors
     /// [`TrainingSetError`].
@@ -75,7 +75,7 @@ impl TrainingSet {
         TrainingSet::of_opened(&BopDataset::open(root, split)?, ids, frames, min_visibility)
     }
 
-    /// The same of an opened dataset, with the models that were chosen for it.
+    /// The same for an opened dataset, with its chosen models.
     ///
     /// # Errors
     /// [`TrainingSetError`].
@@ -131,7 +131,7 @@ impl TrainingSet {
         Ok(TrainingSet { objects, images, frames, description })
     }
 
-    /// Meshes by their ids, to be learnt from renders; `names` stands for them in the description.
+    /// Meshes by their ids, to be learnt from renders; `names` describes them in the description.
     pub fn of_meshes(meshes: Vec<(u32, Mesh, ModelInfo)>, names: &str) -> TrainingSet {
         TrainingSet {
             objects: meshes.into_iter().map(|(id, mesh, info)| TrainingObject::new(id, mesh, info)).collect(),

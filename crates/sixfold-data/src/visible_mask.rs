@@ -1,8 +1,9 @@
-//! Where an object is visible in an image, kept as the box of its pixels alone: a dataset has thousands of instances.
+//! The mask of a visible object in an image, stored only within its box, because a dataset has thousands of
+//! instances.
 
 use sixfold_geometry::{Mask, Rect, Vec2};
 
-/// A mask cut to its box. Pixels outside the box do not show the object.
+/// A mask cropped to its box. Pixels outside the box do not show the object.
 #[derive(Debug, Clone)]
 pub struct VisibleMask {
     /// Columns and rows of the image.
@@ -18,7 +19,7 @@ pub struct VisibleMask {
 }
 
 impl VisibleMask {
-    /// Cuts a mask of a whole image to its box; one without any pixel has an empty box.
+    /// Crops a mask of a whole image to its box; an empty mask has an empty box.
     pub fn new(mask: &Mask) -> Self {
         let (mut x0, mut y0, mut x1, mut y1) = (usize::MAX, usize::MAX, 0, 0);
         let mut outline = Vec::new();
@@ -29,7 +30,7 @@ impl VisibleMask {
             let last = row.iter().rposition(|v| *v).unwrap_or(first);
             pixels += row.iter().filter(|v| **v).count();
             (x0, y0, x1, y1) = (x0.min(first), y0.min(y), x1.max(last + 1), y1.max(y + 1));
-            // Corners of the row's outermost pixels.
+            // The corners of the row's first and last pixels.
             for dy in [-0.5, 0.5] {
                 outline.push(Vec2::new(first as f64 - 0.5, y as f64 + dy));
                 outline.push(Vec2::new(last as f64 + 0.5, y as f64 + dy));
@@ -43,18 +44,18 @@ impl VisibleMask {
         VisibleMask { size: mask.size(), x: x0, y: y0, width, height, data, pixels, outline }
     }
 
-    /// Box and pixels as bytes: what tells it from another mask.
+    /// Box and pixels as bytes, which identify the mask.
     pub(crate) fn parts(&self) -> [Vec<u8>; 2] {
         let numbers = [self.size.0, self.size.1, self.x, self.y, self.width, self.height];
         [numbers.iter().flat_map(|n| (*n as u64).to_le_bytes()).collect(), self.data.clone()]
     }
 
-    /// Columns and rows of the image that the mask is of.
+    /// Columns and rows of the image of the mask.
     pub fn image_size(&self) -> (usize, usize) {
         self.size
     }
 
-    /// How many pixels show the object.
+    /// Number of pixels that show the object.
     pub fn pixels(&self) -> usize {
         self.pixels
     }
@@ -65,7 +66,7 @@ impl VisibleMask {
         Rect { x: side(self.x), y: side(self.y), width: side(self.width), height: side(self.height) }
     }
 
-    /// Points of the image whose box is that of the visible part, however the image is rotated.
+    /// Points of the image whose bounding box is that of the visible part for any rotation of the image.
     pub fn outline(&self) -> &[Vec2] {
         &self.outline
     }
@@ -80,7 +81,7 @@ impl VisibleMask {
             && self.data[y as usize * self.width + x as usize] > 0
     }
 
-    /// How much the place `(u, v)` of the image shows of the object, 0 to 1, bilinear.
+    /// The bilinearly interpolated mask at `(u, v)` of the image, 0 to 1.
     pub fn sample(&self, u: f32, v: f32) -> f32 {
         let at = |x: isize, y: isize| f32::from(u8::from(self.contains(x, y)));
         let (x, y) = (u.floor(), v.floor());

@@ -1,7 +1,9 @@
-//! What methods derive from mesh files, kept between runs: one folder per mesh in the user's cache, never beside the mesh.
+//! Storage for the data that methods derive from mesh files, kept between runs: one folder per mesh in the user's cache, never
+//! beside the mesh.
 //!
-//! Bounded: when the cache grows beyond its limit, the folders that were used least recently go. Two processes may share it:
-//! files are written under another name first, a folder's name is a hash of the mesh, and a file that disappears is made again.
+//! The size is bounded: when the cache exceeds its limit, the least recently used folders are removed. Several processes may
+//! share it: files are written under another name first, a folder's name is a hash of the mesh, and a file that disappears is
+//! made again.
 
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
@@ -23,12 +25,12 @@ pub enum CacheError {
     Io {
         /// The folder.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
 }
 
-/// A folder for what can be computed again.
+/// A folder for data that can be computed again.
 #[derive(Debug, Clone, Default)]
 pub struct Cache {
     folder: Option<PathBuf>,
@@ -36,7 +38,7 @@ pub struct Cache {
 }
 
 impl Cache {
-    /// Bytes that a cache holds at most unless set otherwise: some hundred objects with templates and descriptors.
+    /// Default limit of a cache in bytes: some hundred objects with templates and descriptors.
     pub const LIMIT: u64 = 1 << 30;
 
     /// A cache that keeps nothing.
@@ -50,7 +52,7 @@ impl Cache {
     }
 
     /// The user's cache: `$XDG_CACHE_HOME/sixfold`, else `~/.cache/sixfold` (XDG Base Directory Specification 0.8); nothing is
-    /// kept where neither variable is set.
+    /// stored if neither variable is set.
     pub fn of_user() -> Cache {
         let absolute = |name: &str| std::env::var_os(name).map(PathBuf::from).filter(|p| p.is_absolute());
         let base = absolute("XDG_CACHE_HOME").or_else(|| absolute("HOME").map(|home| home.join(".cache")));
@@ -62,7 +64,7 @@ impl Cache {
         self.folder.as_deref()
     }
 
-    /// The folder for what is derived from a mesh with its symmetries; marks it as used. `None` without a cache.
+    /// The folder for the data derived from a mesh with its symmetries; marks it as used. `None` without a cache.
     ///
     /// # Errors
     /// [`CacheError`] where the folder cannot be made.
@@ -71,13 +73,13 @@ impl Cache {
         let folder = root.join(format!("{:016x}", fingerprint(mesh, info)));
         let io = |source| CacheError::Io { path: folder.clone(), source };
         std::fs::create_dir_all(&folder).map_err(io)?;
-        // When a folder was last used is the age of this file; where it cannot be written, the folder goes sooner.
+        // The age of this file states when the folder was last used; if it cannot be written, the folder is removed sooner.
         let _ = std::fs::write(folder.join(USED), b"");
         self.prune(&folder);
         Ok(Some(folder))
     }
 
-    /// Removes the folders that were used least recently until the cache is within its limit; `keep` stays.
+    /// Removes the least recently used folders until the cache is within its limit; `keep` stays.
     fn prune(&self, keep: &Path) {
         let Some(entries) = self.folder.as_ref().and_then(|f| std::fs::read_dir(f).ok()) else { return };
         let mut folders: Vec<(SystemTime, u64, PathBuf)> = entries
@@ -102,10 +104,10 @@ impl Cache {
     }
 }
 
-/// The file whose age says when a folder was last used.
+/// The file whose age states when a folder was last used.
 const USED: &str = "used";
 
-/// Whether a folder is one of the cache's: nothing else that lies there is ever removed.
+/// Whether a folder belongs to the cache: nothing else there is ever removed.
 fn is_of_cache(path: &Path) -> bool {
     let name = path.file_name().and_then(|n| n.to_str()).unwrap_or_default();
     path.is_dir() && name.len() == 16 && name.bytes().all(|b| b.is_ascii_hexdigit())
@@ -164,7 +166,7 @@ mod tests {
             let mesh = mesh(scale);
             let folder = cache.of_mesh(&mesh, &ModelInfo::of_mesh(&mesh)).unwrap().unwrap();
             std::fs::write(folder.join("ppf.bin"), [0; 1000]).unwrap();
-            // Times of files are as fine as the system's clock.
+            // File times have only the resolution of the system's clock.
             std::thread::sleep(std::time::Duration::from_millis(20));
             folders.push(folder);
         }

@@ -1,28 +1,28 @@
-//! Who says where objects are: the interface of a detector.
+//! The interface of a detector, which finds the regions of objects.
 
 use sixfold_geometry::RgbImage;
 
 use crate::error::EstimatorError;
 use crate::region::Region;
 
-/// An object that a detector sees.
+/// A detected object.
 #[derive(Debug, Clone)]
 pub struct DetectedObject {
     /// Its number among the detector's objects.
     pub object_id: u32,
-    /// Where it is, and how sure that is.
+    /// Its region, with the confidence.
     pub region: Region,
 }
 
 /// Finds the regions of known objects in colour images.
 pub trait ObjectDetector: Send + Sync {
-    /// An error unless the detector knows the object.
+    /// An error unless the detector was trained on the object.
     ///
     /// # Errors
     /// [`EstimatorError::Method`].
     fn check_object(&self, object_id: u32) -> Result<(), EstimatorError>;
 
-    /// What it sees in an image, the most confident first.
+    /// The detections in an image, the most confident first.
     ///
     /// # Errors
     /// [`EstimatorError::Method`].

@@ -3,14 +3,14 @@
 use sixfold_align::PreparedDepthError;
 use thiserror::Error;
 
-/// What any error of a method is wrapped in.
+/// The error of a method, boxed.
 pub(crate) type Source = Box<dyn std::error::Error + Send + Sync>;
 
 /// Why a method cannot prepare an object or answer a query.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum EstimatorError {
-    /// The object lacks what the method works on.
+    /// The object lacks data that the method needs.
     #[error("object {object}: has no {what}, which --method {method} needs; {advice}")]
     Lacks {
         /// The object.
@@ -22,7 +22,7 @@ pub enum EstimatorError {
         /// What to do.
         advice: &'static str,
     },
-    /// The object cannot be described.
+    /// The object cannot be prepared.
     #[error("object {object}")]
     Object {
         /// The object.
@@ -30,7 +30,7 @@ pub enum EstimatorError {
         /// Why.
         source: Source,
     },
-    /// The query lacks what the method works on.
+    /// The query lacks an input that the method needs.
     #[error("has no {what}, which --method {method} needs; {advice}")]
     Input {
         /// What it lacks.

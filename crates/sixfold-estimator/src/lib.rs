@@ -1,9 +1,9 @@
-//! What a pose estimation method is. A method implements [`PoseEstimator`]: it prepares an [`Object`] once and answers a
-//! [`Query`] (an image, and where to look in it) with [`PoseEstimate`]s. Runners, programs and other languages know methods by
-//! this trait alone; no method is known here.
+//! The interface of pose estimation methods. A method implements [`PoseEstimator`]: it prepares an [`Object`] once and answers
+//! a [`Query`] (an image and a region of it) with [`PoseEstimate`]s. Runners, programs and other languages use methods through
+//! this trait only; this crate depends on no method.
 //!
-//! Objects come from mesh files or from an [`ObjectStore`], a folder of named objects. What methods derive from an object
-//! (descriptions, templates) is kept in its folder there, or for a mesh file in a [`Cache`].
+//! Objects come from mesh files or from an [`ObjectStore`], a folder of named objects. Data that methods derive from an object
+//! (descriptions, templates) is stored in its folder there, or for a mesh file in a [`Cache`].
 
 #![warn(unreachable_pub, unnameable_types)]
 

@@ -13,77 +13,77 @@ use crate::query::Query;
 /// How much a method depends on an input.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Need {
-    /// It makes no use of it.
+    /// The input is not used.
     #[default]
     Unused,
-    /// It works without.
+    /// The method works without it, and uses it if given.
     Optional,
-    /// It cannot do without.
+    /// The method needs it.
     Required,
 }
 
-/// What a method needs of a query and of an object.
+/// The inputs that a method needs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Needs {
     /// A depth image.
     pub depth: Need,
     /// A colour image.
     pub rgb: Need,
-    /// A region that says where in the image the object is.
+    /// A region of the image that contains the object.
     pub region: Need,
-    /// A mesh, or whatever else stands for the object; [`Need::Optional`] where the method's own weights know it.
+    /// A mesh or another model of the object; [`Need::Optional`] if the method's weights contain the object.
     pub object: Need,
 }
 
-/// The confidence below which estimates are left out unless the caller says otherwise.
+/// The confidence below which estimates are left out, unless the caller sets another.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MinConfidence {
-    /// For a person who asks about one image and wants no guesses.
+    /// For a single image, where a person wants no guesses.
     pub image: f64,
-    /// For a dataset, whose scores sort guesses out.
+    /// For a dataset, whose scores take low confidences into account.
     pub dataset: f64,
 }
 
-/// An object as a method knows it.
+/// An object prepared for a method.
 pub trait PreparedObject: Any + Send + Sync {
-    /// What people call it.
+    /// Its name for people.
     fn name(&self) -> &str;
 
-    /// What overlays render for it, where there is a mesh.
+    /// The mesh that overlays render, if there is one.
     fn mesh(&self) -> Option<&Mesh>;
 
-    /// What happened on the way that a user should know, a sentence each: a cached file that was not usable, say.
+    /// Notes for the user about the preparation, one sentence each, such as an unusable cached file.
     fn notes(&self) -> &[String] {
         &[]
     }
 }
 
-/// A method that finds objects in images. The same query gives the same answer at any number of threads.
+/// A method that finds objects in images. The same query gives the same answer for any number of threads.
 pub trait PoseEstimator: Send + Sync {
-    /// As it is called on the command line and in records: `ppf`.
+    /// Its name on the command line and in records, such as `ppf`.
     fn name(&self) -> &'static str;
 
-    /// What it needs.
+    /// Its required and optional inputs.
     fn needs(&self) -> Needs;
 
-    /// How depth images are prepared for it.
+    /// The options with which depth images are prepared for it.
     fn depth_options(&self) -> DepthOptions {
         DepthOptions::default()
     }
 
-    /// The usual thresholds of its confidence.
+    /// The default thresholds of its confidence.
     fn min_confidence(&self) -> MinConfidence {
         MinConfidence { image: 0.0, dataset: 0.0 }
     }
 
-    /// Derives once from an object what every query needs; kept in the object's folder where it takes time
-    /// ([`Object::file`]).
+    /// Computes once from an object the data that every query needs; slow results are stored in the object's
+    /// folder ([`Object::file`]).
     ///
     /// # Errors
     /// [`EstimatorError::Lacks`] and [`EstimatorError::Object`].
     fn prepare(&self, object: &Object) -> Result<Box<dyn PreparedObject>, EstimatorError>;
 
-    /// Finds the object, best first; empty where it is not found.
+    /// Finds the object; returns estimates, the best first, or none if it is not found.
     ///
     /// # Errors
     /// [`EstimatorError`]; [`EstimatorError::Region`] concerns this region alone.

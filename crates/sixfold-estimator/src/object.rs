@@ -7,10 +7,10 @@ use sixfold_mesh::{Mesh, ModelInfo};
 
 use crate::error::EstimatorError;
 
-/// An object to be found: a mesh, or what methods know of it without one.
+/// An object to be found: a mesh, or an object known to methods without one.
 #[derive(Debug, Clone)]
 pub struct Object {
-    /// What people call it; names no file.
+    /// Its name for people; not a file name.
     pub name: String,
     /// Its number in a dataset, in a trained model or in a detector.
     pub id: Option<u32>,
@@ -18,12 +18,12 @@ pub struct Object {
     pub mesh: Option<Arc<Mesh>>,
     /// Diameter and symmetries; `None` without a mesh.
     pub info: Option<ModelInfo>,
-    /// The folder in which methods keep what they derive from it; `None` to keep nothing.
+    /// The folder in which methods store derived data; `None` to store nothing.
     pub folder: Option<PathBuf>,
 }
 
 impl Object {
-    /// An object of which only the number in a trained model is known.
+    /// An object that is known only by its number in a trained model.
     pub fn of_model(id: Option<u32>) -> Object {
         Object { name: String::new(), id, mesh: None, info: None, folder: None }
     }
@@ -33,12 +33,13 @@ impl Object {
         Object { name: name.into(), id: None, mesh: Some(Arc::new(mesh)), info: Some(info), folder: None }
     }
 
-    /// Where a method keeps what it derives, `None` to keep nothing. `name` names method and content: `ppf.bin`.
+    /// The file in which a method stores derived data; `None` to store nothing. `name` states method and
+    /// content: `ppf.bin`.
     pub fn file(&self, name: &str) -> Option<PathBuf> {
         self.folder.as_ref().map(|folder| folder.join(name))
     }
 
-    /// The mesh, for methods that cannot do without.
+    /// The mesh, for methods that need one.
     ///
     /// # Errors
     /// [`EstimatorError::Lacks`].

@@ -1,4 +1,4 @@
-//! What a method is asked: an image and where to look in it.
+//! A query to a method: an image and the region to search.
 
 use std::any::{Any, TypeId};
 use std::collections::HashMap;
@@ -10,19 +10,20 @@ use sixfold_geometry::{Camera, OptionError, RgbImage};
 use crate::error::EstimatorError;
 use crate::region::Region;
 
-/// What methods derive from a query once and use for every object that is searched in it, by type. A clone is the same memo.
+/// Data that methods compute once per query and use for every object that is searched in it, by type. A clone shares the same
+/// memo.
 #[derive(Default, Clone)]
 pub struct Memo(Arc<Mutex<Kept>>);
 
 type Kept = HashMap<TypeId, Arc<dyn Any + Send + Sync>>;
 
 impl Memo {
-    /// The value of this type, made when first asked for.
+    /// The value of this type, made at the first request.
     pub fn get_or_default<T: Default + Send + Sync + 'static>(&self) -> Arc<T> {
         let mut kept = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         let any = kept.entry(TypeId::of::<T>()).or_insert_with(|| Arc::new(T::default())).clone();
         drop(kept);
-        // The entry of this type's id holds this type.
+        // The entry under this type's id always holds this type.
         any.downcast().unwrap_or_default()
     }
 }
@@ -35,8 +36,8 @@ pub fn check_min_confidence(value: f64) -> Result<(), OptionError> {
     OptionError::unless_within("min_confidence", value, 0.0.., "a number, 0 to 1")
 }
 
-/// An image of a pinhole camera and where to look in it. One query serves any number of objects: what depends on the image alone
-/// is computed once.
+/// An image of a pinhole camera and the region to search. One query can be used for any number of objects: data that depends
+/// only on the image is computed once.
 pub struct Query<'a> {
     /// The camera, without lens distortion.
     pub camera: &'a Camera,
@@ -44,15 +45,15 @@ pub struct Query<'a> {
     pub rgb: Option<&'a RgbImage>,
     /// The depth image, prepared with the method's own [`depth_options`](crate::PoseEstimator::depth_options).
     pub depth: Option<&'a Arc<PreparedDepth>>,
-    /// Where to look; `None` is everywhere.
+    /// The region to search; `None` for the whole image.
     pub region: Option<&'a Region>,
-    /// Most instances of an object, 1 or more.
+    /// Maximum number of instances of an object, 1 or more.
     pub max_instances: usize,
-    /// Estimates of lower confidence are left out, 0 or more. Confidences are 0 to 1: above 1 all are left out.
+    /// Estimates with a lower confidence are left out; 0 or more. Confidences are 0 to 1, so a value above 1 leaves out all.
     pub min_confidence: f64,
     /// Whether images for people are wanted.
     pub diagnostics: bool,
-    /// What methods keep between objects.
+    /// Data that methods share between objects.
     pub memo: Memo,
     /// What [`Query::depth_region`] returns.
     #[doc(hidden)]
@@ -60,7 +61,7 @@ pub struct Query<'a> {
 }
 
 impl<'a> Query<'a> {
-    /// The same question with other limits, as a method asks it that asks others: what depends on the image and the region is
+    /// The same query with other limits, for a method that calls other methods: data that depends on the image and the region is
     /// computed once for all of them.
     #[must_use]
     pub fn passed_on(&self, max_instances: usize, min_confidence: f64) -> Query<'a> {
@@ -77,7 +78,7 @@ impl<'a> Query<'a> {
         }
     }
 
-    /// Everything in the image of this camera, one instance, any confidence; add images and limits by the fields.
+    /// A query for one instance anywhere in this camera's image, with any confidence; set images and limits through the fields.
     pub fn new(camera: &'a Camera) -> Query<'a> {
         Query {
             camera,
@@ -92,7 +93,7 @@ impl<'a> Query<'a> {
         }
     }
 
-    /// Checks the limits. Runners call it before they ask a method.
+    /// Checks the limits. Runners call it before they call a method.
     ///
     /// # Errors
     /// [`OptionError`] with the first limit that is out of its range.
@@ -101,7 +102,7 @@ impl<'a> Query<'a> {
         check_min_confidence(self.min_confidence)
     }
 
-    /// The part of the depth image in which to look.
+    /// The part of the depth image to search.
     ///
     /// # Errors
     /// [`EstimatorError::Input`] without a depth image (`method` is for the message), and [`EstimatorError::Depth`] where the

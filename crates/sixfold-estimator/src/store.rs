@@ -1,9 +1,9 @@
-//! Objects under names: a folder with one folder per object.
+//! Named objects: a folder with one folder per object.
 //!
-//! An object's folder holds `object.json` (format version, unit, symmetries, where it came from), `mesh.ply` (metres), and what
-//! methods derive from it (`ppf.bin`, `templates.bin`). An object added from depth images has templates and no mesh. A folder
-//! is written under another name first and moved into place as a whole; one that is replaced or removed is moved away first. One
-//! process at a time changes an object, and whoever comes after one that was killed tidies up.
+//! An object's folder holds `object.json` (format version, unit, symmetries, source file), `mesh.ply` (metres), and data that
+//! methods derive from it (`ppf.bin`, `templates.bin`). An object added from depth images has templates and no mesh. A folder is
+//! written under another name first and moved into place as a whole; one that is replaced or removed is moved away first. One
+//! process at a time changes an object; after a killed process, the next one cleans up.
 
 use std::collections::BTreeSet;
 use std::io;
@@ -24,24 +24,24 @@ use crate::cache::{Cache, CacheError};
 use crate::error::Source;
 use crate::object::Object;
 
-/// The only version of `object.json` there is.
+/// The only version of `object.json`.
 const VERSION: u32 = 1;
-/// Diameters that an object known from depth images may have, metres: those of the tabletop objects that are taken as meshes.
+/// Allowed diameters of an object known from depth images, metres: the same as for meshes of tabletop objects.
 const DIAMETERS: std::ops::RangeInclusive<f64> =
     sixfold_mesh::SMALLEST_DIAMETER..=sixfold_mesh::LARGEST_DIAMETER;
-/// How far the diameter in `object.json` may be off the mesh's, as a fraction: the mesh is stored in single precision.
+/// Largest relative difference of the diameter in `object.json` and the mesh's: the mesh is stored in single precision.
 const SAME_DIAMETER: f64 = 1e-3;
 /// The same for a point, as a fraction of its distance from the origin.
 const SAME_POINT: f64 = 1e-6;
-/// Most discrete symmetries (with the identity) times axes in `object.json`: a gear with 360 teeth has 360.
+/// Maximum number of discrete symmetries (with the identity) times axes in `object.json`: a gear with 360 teeth has 360.
 const MAX_SYMMETRIES: usize = 1000;
-/// Furthest that a point on an axis, or the way of a symmetry, is from the origin, metres.
+/// Largest distance of a point on an axis from the origin, and largest translation of a symmetry, metres.
 const FURTHEST: f64 = 2.0 * sixfold_mesh::LARGEST_OFFSET;
-/// How long to wait for another process that has moved an object away and not yet put the new one in its place.
+/// How long to wait for another process that has moved an object away and not yet moved the new one into place.
 const PATIENCE: Duration = Duration::from_secs(5);
-/// How often the store is listed again at most until two listings are the same.
+/// Maximum number of listings of the store until two are the same.
 const LISTINGS: usize = 5;
-/// How often an object is looked for at most while another process changes it.
+/// Maximum number of attempts to find an object while another process changes it.
 const ATTEMPTS: usize = 20;
 
 /// Why an object cannot be stored or loaded.
@@ -72,7 +72,7 @@ pub enum StoreError {
         /// The store.
         folder: PathBuf,
     },
-    /// There is something of this name that is none.
+    /// Something with this name exists that is not an object.
     #[error(
         "{} is not a stored object (it has no object.json) and was not changed: give another name, or remove it yourself",
         path.display()
@@ -84,7 +84,7 @@ pub enum StoreError {
     /// Another process changes the object.
     #[error(transparent)]
     Locked(#[from] LockError),
-    /// `object.json` is not what it should be.
+    /// `object.json` is invalid.
     #[error("{}: {what}; add the object again with `sixfold object add {name} ... --replace`", path.display())]
     Record {
         /// The object.
@@ -111,7 +111,7 @@ pub enum StoreError {
     /// The mesh cannot be read or used.
     #[error(transparent)]
     Mesh(#[from] MeshFileError),
-    /// A list of points through which no surface can be laid.
+    /// A list of points through which no surface can be fitted.
     #[error("{name}: no surface can be laid through its points")]
     NoSurface {
         /// The object.
@@ -124,10 +124,10 @@ pub enum StoreError {
     Io {
         /// The file or folder.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: io::Error,
     },
-    /// What a method derives from the new object could not be made or kept; nothing was stored.
+    /// Derived data of the new object could not be computed or stored; nothing was stored.
     #[error("cannot store {}", path.display())]
     Derive {
         /// The object's folder.
@@ -212,7 +212,7 @@ impl ObjectRecord {
         }
     }
 
-    /// Diameter, box and symmetries; what is wrong with the record beside this mesh otherwise.
+    /// Diameter, box and symmetries; an error describes how the record contradicts the mesh.
     fn info(&self, mesh: &Mesh) -> Result<ModelInfo, String> {
         let mut info = ModelInfo::of_mesh(mesh);
         let furthest = info.min.abs().sup(&(info.min + info.size).abs()).amax();
@@ -273,7 +273,7 @@ pub struct NewObject<'a> {
     pub mesh: Option<&'a Mesh>,
     /// Its record.
     pub record: &'a ObjectRecord,
-    /// Replace an object of the same name.
+    /// Whether an object of the same name is replaced.
     pub replace: bool,
 }
 
@@ -284,7 +284,7 @@ pub struct ObjectStore {
 }
 
 impl ObjectStore {
-    /// The store in a folder, which need not be there yet.
+    /// The store in a folder, which need not exist yet.
     pub fn new(folder: impl Into<PathBuf>) -> ObjectStore {
         ObjectStore { folder: folder.into() }
     }
@@ -304,25 +304,25 @@ impl ObjectStore {
         if place.exists() { Ok(place) } else { Ok(self.restored(name, place)) }
     }
 
-    /// [`ObjectStore::place`] for who changes the object.
+    /// [`ObjectStore::place`] for callers that change the object.
     fn writable_place(&self, name: &str) -> Result<PathBuf, StoreError> {
         let (found, place) = (self.place(name)?, self.folder.join(name));
         if found == place {
             return Ok(place);
         }
-        // It is the only copy.
+        // This is the only copy.
         let what = format!("{} cannot be moved back there", found.display());
         Err(StoreError::Io { path: place, source: io::Error::other(what) })
     }
 
-    /// Where an object is that is not in its place. A process that was killed between the two steps of a replacement left it beside:
-    /// it is put back. One that is between them now is waited for.
+    /// Finds an object that is not in its place. If a process was killed between the two steps of a replacement, the old object is
+    /// moved back. If a process is between them now, this waits for it.
     fn restored(&self, name: &str, place: PathBuf) -> PathBuf {
         let start = Instant::now();
         loop {
             let Some(old) = self.beside(name, OLD).into_iter().find(|p| is_object(p)) else { return place };
             match WriteLock::take(&place) {
-                // The place may have been taken meanwhile, by a whole new object: that is then the one.
+                // A complete new object may be in the place meanwhile: then this one is used.
                 Ok(_lock) if place.exists() || std::fs::rename(&old, &place).is_ok() => return place,
                 Err(LockError::Taken { .. }) if start.elapsed() < PATIENCE => {
                     std::thread::sleep(Duration::from_millis(5));
@@ -330,13 +330,13 @@ impl ObjectStore {
                         return place;
                     }
                 }
-                // A store that may only be read.
+                // A read-only store.
                 _ => return old,
             }
         }
     }
 
-    /// What an unfinished change of an object left beside it: folders `.NAME.PROCESS.ENDING`.
+    /// Folders that an unfinished change left beside an object: `.NAME.PROCESS.ENDING`.
     fn beside(&self, name: &str, ending: &str) -> Vec<PathBuf> {
         let (prefix, ending) = (format!(".{name}."), format!(".{ending}"));
         let entries = std::fs::read_dir(&self.folder).into_iter().flatten().flatten().map(|e| e.path());
@@ -348,15 +348,15 @@ impl ObjectStore {
         entries.filter(of_this).collect()
     }
 
-    /// A name beside an object's for this process.
+    /// The name of this process's folder beside an object.
     fn own(&self, name: &str, ending: &str) -> PathBuf {
         self.folder.join(format!(".{name}.{}.{ending}", std::process::id()))
     }
 
-    /// Removes what killed processes left of an object that is in its place, or nowhere. The caller holds its lock.
+    /// Removes the leftovers of killed processes for an object that is in its place or does not exist. The caller holds its lock.
     fn tidy(&self, name: &str) {
         for path in [NEW, OLD, GONE].into_iter().flat_map(|ending| self.beside(name, ending)) {
-            // What cannot be removed takes room, nothing else.
+            // Folders that cannot be removed only take space.
             let _ = std::fs::remove_dir_all(path);
         }
     }
@@ -366,7 +366,7 @@ impl ObjectStore {
         self.whole(name, |place| is_object(place).then_some(())).is_some()
     }
 
-    /// What `read` finds in the object's folder. It may be moved away just then, by a replacement: then it is looked for again.
+    /// The result of `read` on the object's folder. If a replacement moves the folder away at that moment, it is searched again.
     fn whole<T>(&self, name: &str, read: impl Fn(&Path) -> Option<T>) -> Option<T> {
         for _ in 0..ATTEMPTS {
             let found = self.place(name).ok().and_then(|place| read(&place));
@@ -378,7 +378,7 @@ impl ObjectStore {
         None
     }
 
-    /// Whether a process replaces or removes the object now, or was killed while it did.
+    /// Whether a process is replacing or removing the object, or was killed while doing so.
     fn is_changing(&self, name: &str) -> bool {
         self.folder.join(format!(".{name}.lock")).exists() || !self.beside(name, OLD).is_empty()
     }
@@ -389,7 +389,7 @@ impl ObjectStore {
     /// [`StoreError::Io`] where the folder cannot be read.
     pub fn names(&self) -> Result<Vec<String>, StoreError> {
         let mut names = self.names_once()?;
-        // A folder that is renamed while the store is listed may be met under neither name.
+        // A folder that is renamed while the store is listed may be missing under both names.
         for _ in 0..LISTINGS {
             let again = self.names_once()?;
             if again == names {
@@ -410,7 +410,7 @@ impl ObjectStore {
         for entry in entries {
             let entry = entry.map_err(|e| self.io(e))?.file_name();
             let Some(entry) = entry.to_str() else { continue };
-            // Of `.NAME.PROCESS.old` the name: a replacement is under way, or was.
+            // `.NAME.PROCESS.old` gives the name too: a replacement is in progress or was interrupted.
             let name = match entry.strip_prefix('.') {
                 Some(rest) if entry.ends_with(OLD) => rest.split('.').next().unwrap_or_default(),
                 _ => entry,
@@ -473,18 +473,18 @@ impl ObjectStore {
         Ok(record)
     }
 
-    /// An object with what it needs to be prepared.
+    /// An object with the data needed to prepare it.
     ///
     /// # Errors
     /// [`StoreError`].
     pub fn load(&self, name: &str) -> Result<Object, StoreError> {
         let read = || loaded(name, &self.record(name)?, self.place(name)?);
-        // Replaced between its files: the second time they are of one object.
+        // The object was replaced while its files were read: the second attempt reads files of one object.
         read().or_else(|_| read())
     }
 
-    /// Stores an object. `derive` is called with it while it lies in a folder beside the store's others, and may keep there what
-    /// methods derive from it; where that fails, nothing is stored.
+    /// Stores an object. Before the object is moved into place, `derive` is called with it and may store derived data in its
+    /// folder; if that fails, nothing is stored.
     ///
     /// # Errors
     /// [`StoreError`].
@@ -511,7 +511,7 @@ impl ObjectStore {
             if let Some(mesh) = new.mesh {
                 write_ply(fresh.join("mesh.ply"), mesh, Unit::Metre, PlyFormat::BinaryLittleEndian)?;
             }
-            // From the stored mesh, whose numbers are rounded: that is what later runs compare them with.
+            // Derive from the stored mesh, whose numbers are rounded, because later runs compare with it.
             derive(&loaded(name, new.record, fresh.clone())?)?;
             write_atomically(
                 &fresh.join("object.json"),
@@ -524,7 +524,7 @@ impl ObjectStore {
         if place.exists() {
             self.tidy(name);
         } else {
-            // The object may lie under its other name alone: it is put back when it is next asked for.
+            // The object may exist only under its other name: it is moved back at the next access.
             let _ = std::fs::remove_dir_all(&fresh);
         }
         result.map_err(|source| StoreError::Derive { path: place, source })
@@ -537,17 +537,17 @@ impl ObjectStore {
     pub fn remove(&self, name: &str) -> Result<(), StoreError> {
         let place = self.writable_place(name)?;
         if !self.folder.exists() {
-            // The error says what there is.
+            // The error lists the existing objects.
             self.record(name)?;
         }
         let _lock = WriteLock::take(&place)?;
-        // Of a removal that was killed halfway too, which has left no object.
+        // Also cleans up after an interrupted removal, which has left no object.
         self.tidy(name);
         if !is_object(&place) {
             self.record(name)?;
         }
         let gone = self.own(name, GONE);
-        // Away as a whole first: killed halfway, it is not half an object.
+        // Rename the folder first, so that an interrupted removal does not leave half an object.
         std::fs::rename(&place, &gone)
             .and_then(|()| sync_folder_of(&place))
             .map_err(|source| StoreError::Io { path: place, source })?;
@@ -555,7 +555,7 @@ impl ObjectStore {
     }
 
     /// The object that a user names: a stored one, or a mesh file in `unit`, whose derived data goes to `cache`. The second value
-    /// is what a user should know of it.
+    /// is a note for the user.
     ///
     /// # Errors
     /// [`StoreError`].
@@ -567,7 +567,7 @@ impl ObjectStore {
     ) -> Result<(Object, Option<String>), StoreError> {
         let path = Path::new(name_or_mesh);
         if self.contains(name_or_mesh) || (path.extension().is_none() && !path.exists()) {
-            // Of an unknown name the error tells the names there are.
+            // For an unknown name, the error lists the existing names.
             let object = self.load(name_or_mesh)?;
             return Ok((object, None));
         }
@@ -581,7 +581,7 @@ impl ObjectStore {
     }
 }
 
-/// Endings of the folders beside an object: one that is being written, one that is being replaced, one that is being removed.
+/// Endings of the folders beside an object: being written, being replaced, being removed.
 const NEW: &str = "new";
 const OLD: &str = "old";
 const GONE: &str = "gone";
@@ -590,8 +590,8 @@ fn is_object(place: &Path) -> bool {
     place.join("object.json").is_file()
 }
 
-/// Puts `fresh` in its place, and what is there before away. Where the second step fails the first is taken back; where that
-/// fails too, the object lies at `away`, where [`ObjectStore::restored`] finds it.
+/// Moves the existing object to `away` and `fresh` into its place. If the second step fails, the first is undone; if that fails
+/// too, the object is at `away`, where [`ObjectStore::restored`] finds it.
 fn swap(
     fresh: &Path,
     place: &Path,
@@ -619,7 +619,7 @@ fn loaded(name: &str, record: &ObjectRecord, folder: PathBuf) -> Result<Object, 
         let mut of_record = record.info(&read).map_err(wrong)?;
         let (surface, laid) = with_surface(name, read)?;
         if laid.is_some() {
-            // The surface that is laid through points has a box of its own.
+            // The surface through the points has a different box.
             let own = ModelInfo::of_mesh(&surface);
             (of_record.diameter, of_record.min, of_record.size) = (own.diameter, own.min, own.size);
         }
@@ -629,7 +629,7 @@ fn loaded(name: &str, record: &ObjectRecord, folder: PathBuf) -> Result<Object, 
     Ok(Object { name: name.to_owned(), id: None, mesh, info, folder: Some(folder) })
 }
 
-/// A model that is only points gets a surface of disks, with a note.
+/// Gives a model of points only a surface of disks, with a note.
 fn with_surface(name: &str, mesh: Mesh) -> Result<(Mesh, Option<String>), StoreError> {
     if !mesh.faces().is_empty() {
         return Ok((mesh, None));
@@ -696,7 +696,7 @@ mod tests {
         assert_eq!(std::fs::read_dir(root.path().join("store")).unwrap().count(), 1);
     }
 
-    /// Both kinds of end between the two renames: the second fails, and the process dies.
+    /// Both kinds of failure between the two renames: the second one fails, or the process dies.
     #[test]
     fn a_replacement_that_ends_between_its_two_renames_loses_nothing() {
         let root = tempfile::tempdir().unwrap();
@@ -719,18 +719,18 @@ mod tests {
                 std::fs::rename(from, to)
             });
             assert_eq!(result.unwrap_err().kind(), io::ErrorKind::StorageFull);
-            // Where taking it back failed too, it is there under its other name alone.
+            // If undoing failed too, it exists only under its other name.
             assert_eq!(place.exists(), failing.len() == 1);
             assert_eq!(store.names().unwrap(), ["part"]);
             assert!((diameter() - mesh(1.0).diameter()).abs() < 1e-6 && place.exists());
         }
-        // Killed between: the same folders, and the lock file of a process that is no more.
+        // Killed between the renames: the same folders, and the lock file of a dead process.
         fresh();
         std::fs::rename(&place, root.path().join(".part.1.old")).unwrap();
         std::fs::write(root.path().join(".part.lock"), "1").unwrap();
         assert_eq!(store.records().unwrap()[0].0, "part");
         assert!((diameter() - mesh(1.0).diameter()).abs() < 1e-6);
-        // Killed behind: the new one stays, what is left of the old one never comes back.
+        // Killed after the renames: the new object stays, and the remains of the old one are not restored.
         std::fs::create_dir(root.path().join(".part.2.old")).unwrap();
         std::fs::copy(place.join("object.json"), root.path().join(".part.2.old/object.json")).unwrap();
         store.remove("part").unwrap();

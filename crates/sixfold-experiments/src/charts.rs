@@ -30,7 +30,7 @@ pub(crate) struct ChartsArguments {
     json: JsonArguments,
 }
 
-/// What was written or compared.
+/// The images that were written or compared.
 #[derive(Debug, Serialize)]
 struct Written {
     images: Vec<String>,
@@ -58,7 +58,7 @@ struct Group {
     label: String,
     /// A file of results.
     file: String,
-    /// Where its values stand in the file (JSON pointers, RFC 6901).
+    /// Where its values are in the file (JSON pointers, RFC 6901).
     values: Vec<String>,
 }
 

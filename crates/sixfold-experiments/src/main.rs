@@ -1,9 +1,9 @@
-//! The program `sixfold-experiments`: methods measured as their papers do, grasps tried in simulation many times. The program
-//! `sixfold` runs it for `sixfold reproduce`, `sixfold grasp compare` and `sixfold grasp measure`.
+//! The program `sixfold-experiments`: methods measured as in their papers, and repeated trials of grasps in simulation. The
+//! program `sixfold` runs it for `sixfold reproduce`, `sixfold grasp compare` and `sixfold grasp measure`.
 //!
 //! Exit status: 0 found, 1 nothing found, 2 error.
 
-// What is printed goes through `sixfold_shell::screen`: its macros take the place of the standard ones.
+// All output goes through `sixfold_shell::screen`, whose macros replace the standard ones.
 #[macro_use]
 extern crate sixfold_shell;
 
@@ -21,7 +21,7 @@ use sixfold_shell::ranges::threads;
 use sixfold_shell::screen::parse;
 use sixfold_shell::{PixelLimit, exit_code, progress, use_threads};
 
-/// The options that would be ignored beside others, and are refused.
+/// Options that would have no effect in combination with others, and are refused.
 const IDLE: &[Idle] = &[
     Idle { command: "grasp measure", options: &["unit", "store"], when: &[When::Without("objects")] },
     Idle { command: "grasp compare", options: &["unit", "store"], when: &[When::Without("objects")] },

@@ -1,4 +1,4 @@
-//! What holds behind each reader, whatever the bytes: finite, within bounds, consistent. All imports of readers are here.
+//! Checks of each reader's result for any bytes: finite, within bounds, consistent. All imports of readers are here.
 
 use std::path::{Path, PathBuf};
 
@@ -31,7 +31,7 @@ use sixfold_ppf::ObjectModel;
 use crate::mutate::with_png_checksums;
 use crate::seeds;
 
-/// Runs a reader of paths on bytes, in a file of its own with this name.
+/// Runs a reader of paths on bytes, in a separate file with this name.
 fn with_file<T>(name: &str, bytes: &[u8], read: impl FnOnce(&Path) -> T) -> T {
     let folder = tempfile::tempdir().expect("a temporary folder can be made");
     let path: PathBuf = folder.path().join(name);
@@ -182,7 +182,7 @@ pub(crate) fn results(bytes: &[u8]) {
     assert!(estimates.len() + bad.len() <= lines, "no more rows than lines");
 }
 
-/// Meta files of HO-3D: data, whatever they would call.
+/// Meta files of HO-3D: only data, whatever functions they would call.
 pub(crate) fn pickle(bytes: &[u8]) {
     parsers::pickle(bytes);
 }
@@ -266,7 +266,7 @@ pub(crate) fn weights(bytes: &[u8]) {
     });
 }
 
-/// A damaged description is made again: the object is described all the same.
+/// A damaged description is made again, so the object is described in any case.
 pub(crate) fn ppf(bytes: &[u8]) {
     with_file("object.sixfold-ppf", bytes, |path| {
         let described = ObjectModel::cached(path, &seeds::tetrahedron(), &[], &seeds::coarse());
@@ -373,7 +373,7 @@ pub(crate) fn training_log(bytes: &[u8]) {
     });
 }
 
-/// A store is a database file: whatever it holds, each experience is read or refused.
+/// A store is a database file: each experience is read or refused, whatever the file contains.
 #[cfg(feature = "networks")]
 pub(crate) fn experience(bytes: &[u8]) {
     with_file("experience.db", bytes, |path| {

@@ -1,8 +1,8 @@
-//! Hostile input for every reader of files: each takes any bytes and gives an error or content that holds what its type
-//! promises, never a panic, and never more memory or time than the input's size asks for.
+//! Hostile input for every reader of files: for any bytes, each returns an error or content that satisfies the invariants
+//! of its type. It never panics, and memory and time stay in proportion to the input's size.
 //!
-//! [`readers`] names them, with their seeds and what is asserted behind each. The program of this crate mutates the seeds
-//! with a seeded generator; the target in `fuzz/` hands the same checks to cargo-fuzz, which needs a nightly compiler.
+//! [`readers`] lists them, with their seeds and checks. The program of this crate mutates the seeds with a seeded
+//! generator; the target in `fuzz/` hands the same checks to cargo-fuzz, which needs a nightly compiler.
 
 mod checks;
 mod mutate;

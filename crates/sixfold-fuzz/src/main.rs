@@ -1,7 +1,7 @@
-//! Runs every reader on so many mutated files: `cargo run --release -p sixfold-fuzz -- --inputs 3000 --seed 1`.
+//! Runs every reader on a number of mutated files: `cargo run --release -p sixfold-fuzz -- --inputs 3000 --seed 1`.
 //!
-//! The inputs follow from the seed alone. The one that is being read stands in the folder of `--out`, so that it is there
-//! after a panic, a stack overflow or an allocation that fails alike; after a panic it keeps a name of its own.
+//! The inputs depend only on the seed. The current input is written to the folder of `--out`, so that it is available
+//! after a panic, a stack overflow or a failed allocation; after a panic it gets its own name.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
@@ -18,7 +18,7 @@ const USAGE: &str = "usage: sixfold-fuzz [--inputs N] [--seed S] [--reader NAME]
     --reader NAME  this reader alone\n\
     --out DIR      folder for inputs that are findings (default: out/fuzz)\n\
     FILE           read this file with --reader and nothing else: a finding, again";
-/// A reader that takes longer for a file of a few kilobytes has a finding.
+/// Longest time of a reader for a file of a few kilobytes; a longer time is a finding.
 const LIMIT: Duration = Duration::from_secs(10);
 
 struct Arguments {
@@ -63,7 +63,7 @@ fn arguments() -> Result<Arguments, String> {
     Ok(a)
 }
 
-/// How many findings there were.
+/// Returns the number of findings.
 fn run(a: &Arguments) -> Result<usize, String> {
     let all = readers();
     let names: Vec<&str> = all.iter().map(|r| r.name).collect();
@@ -97,7 +97,7 @@ fn fuzz(a: &Arguments, reader: &Reader, stream: u64) -> Result<usize, String> {
     let current = a.out.join(format!("{}.current", reader.name));
     let (mut findings, mut slowest, start) = (0, Duration::ZERO, Instant::now());
     let inputs = a.inputs.div_ceil(reader.cost);
-    // The seeds themselves come first: they have to be read, so that the mutations start from files that work.
+    // The seeds themselves come first: they must be readable, so that mutations start from valid files.
     for number in 0..seeds.len() + inputs {
         let mut bytes = seeds.get(number).cloned().unwrap_or_else(|| mutated(&seeds, &mut random));
         if reader.checksum && number >= seeds.len() && random.random_bool(0.5) {

@@ -3,7 +3,7 @@
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 
-/// What parsers of numbers stumble over.
+/// Numbers that are difficult for parsers.
 const NUMBERS: [&str; 14] = [
     "0",
     "-1",
@@ -50,8 +50,8 @@ pub fn mutated(seeds: &[Vec<u8>], random: &mut ChaCha8Rng) -> Vec<u8> {
     bytes
 }
 
-/// The bytes with the last eight replaced by the FNV-1a sum of those before, as our binary files end: a mutation past the
-/// checksum reaches the reader behind it.
+/// The bytes with the last eight replaced by the FNV-1a sum of those before, as our binary files end, so that a mutation
+/// passes the check and reaches the reader.
 pub fn with_checksum(mut bytes: Vec<u8>) -> Vec<u8> {
     let Some(end) = bytes.len().checked_sub(8) else { return bytes };
     let sum = sixfold_io::fnv1a(&bytes[..end]);
@@ -59,7 +59,7 @@ pub fn with_checksum(mut bytes: Vec<u8>) -> Vec<u8> {
     bytes
 }
 
-/// The bytes with the right checksum behind every chunk of a PNG: the same for images.
+/// The bytes with the right checksum after every chunk of a PNG: the same for images.
 pub(crate) fn with_png_checksums(mut bytes: Vec<u8>) -> Vec<u8> {
     let mut at = 8;
     while let Some(head) = bytes.get(at..at + 4) {
@@ -77,7 +77,7 @@ pub(crate) fn with_png_checksums(mut bytes: Vec<u8>) -> Vec<u8> {
     bytes
 }
 
-/// A part of the bytes, empty where there are none.
+/// A random range of the bytes; empty if there are none.
 fn part(bytes: &[u8], longest: usize, random: &mut ChaCha8Rng) -> std::ops::Range<usize> {
     if bytes.is_empty() {
         return 0..0;
@@ -131,7 +131,7 @@ fn change_word(bytes: &mut [u8], random: &mut ChaCha8Rng) {
     }
 }
 
-/// Replaces the number at, or next behind, some place of a text.
+/// Replaces the number at, or next after, a random position of a text.
 fn change_number(bytes: &mut Vec<u8>, random: &mut ChaCha8Rng) {
     let of_number = |b: &u8| b.is_ascii_digit() || matches!(b, b'.' | b'-' | b'+' | b'e' | b'E');
     let from = part(bytes, 1, random).start;

@@ -1,26 +1,26 @@
-//! The list of readers: a new one is a line here, a check in `checks.rs` and its seeds in `seeds.rs`.
+//! The list of readers: a new reader needs a line here, a check in `checks.rs` and seeds in `seeds.rs`.
 
 use crate::{checks, seeds};
 
 /// A reader of files under test.
 #[derive(Debug, Clone, Copy)]
 pub struct Reader {
-    /// What `--reader` calls it.
+    /// Its name for `--reader`.
     pub name: &'static str,
     /// Files that it can read, to be mutated.
     pub seeds: fn() -> Vec<Vec<u8>>,
-    /// Reads the bytes and asserts what holds of the content.
+    /// Reads the bytes and asserts the invariants of the content.
     ///
     /// # Panics
-    /// When something does not hold: that is a finding.
+    /// When an invariant does not hold, which is a finding.
     pub check: fn(&[u8]),
-    /// How many inputs of a fast reader one input here takes as long as.
+    /// Time of one input relative to one input of a fast reader.
     pub cost: usize,
-    /// Whether the file ends in a checksum, which half of the inputs then carry correctly.
+    /// Whether the file ends in a checksum; then half of the inputs get a correct one.
     pub checksum: bool,
 }
 
-/// Every reader of files from outside.
+/// All readers of external files.
 pub fn readers() -> Vec<Reader> {
     let fast = |name, seeds, check| Reader { name, seeds, check, cost: 1, checksum: false };
     let slow = |cost, reader: Reader| Reader { cost, ..reader };

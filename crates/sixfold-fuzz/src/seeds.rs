@@ -1,4 +1,5 @@
-//! Small valid files of every format, which mutations start from. All of them are made here: nothing is read.
+//! Small valid files of every format, from which mutations start. All of them are generated here; no file is
+//! read.
 
 use image::{DynamicImage, GrayAlphaImage, ImageBuffer, ImageFormat, LumaA, Rgb, Rgba, RgbaImage};
 use sixfold_align::VerificationMesh;
@@ -37,7 +38,7 @@ pub(crate) fn tetrahedron() -> Mesh {
     Mesh::new(corners, vec![[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]).expect("a tetrahedron is a mesh")
 }
 
-/// Coarse descriptions: quick to make again.
+/// Options for coarse descriptions, which are quick to compute.
 pub(crate) fn coarse() -> ModelOptions {
     ModelOptions { sampling_step: 0.2, ..ModelOptions::default() }
 }
@@ -284,7 +285,7 @@ pub(crate) fn ppf() -> Vec<Vec<u8>> {
     vec![description]
 }
 
-/// A wavy sheet of a few more faces than are rendered.
+/// A wavy sheet with a few more faces than the limit for rendering.
 pub(crate) fn fine() -> Mesh {
     let side = 46u32;
     let at = |i: u32| {

@@ -1,4 +1,4 @@
-//! A bounded number of hostile files for every reader, by the driver itself.
+//! Runs the driver with a bounded number of hostile files for every reader.
 
 use std::process::Command;
 

@@ -2,8 +2,8 @@
 //! `cargo run --release -p sixfold-geometry --example bench_icp -- CLOUDS`.
 //!
 //! CLOUDS, little-endian: number of cases (u64); per case the numbers of target and source points (u64), target points and
-//! normals, source points and normals (n x 3 f64 each, metres), the initial pose (12 f64, rows of `[R t]`). Prints a line per case:
-//! milliseconds to build the index, milliseconds to align (median of three), rotation (row by row), translation.
+//! normals, source points and normals (n x 3 f64 each, metres), the initial pose (12 f64, rows of `[R t]`). Prints one line per
+//! case: milliseconds to build the index, milliseconds to align (median of three), rotation (row by row), translation.
 
 use std::time::Instant;
 

@@ -2,7 +2,7 @@
 //! `cargo run --release -p sixfold-geometry --example bench_pnp -- CASES [ap3p|epnp] [--min N] [--noise-window X] ...`.
 //!
 //! CASES, little-endian: `fx fy cx cy` (f64), number of cases and of correspondences in each (u64), then per case object points
-//! (n x 3 f64, metres) and image points (n x 2 f64, pixels). Prints a line per case: milliseconds (median of three), samples,
+//! (n x 3 f64, metres) and image points (n x 2 f64, pixels). Prints one line per case: milliseconds (median of three), samples,
 //! rotation (row by row), translation in metres.
 
 use std::time::Instant;

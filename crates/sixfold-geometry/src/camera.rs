@@ -1,32 +1,34 @@
-//! The pinhole camera, with Brown-Conrady distortion that is undone at the edge of the system.
+//! The pinhole camera, with Brown-Conrady distortion that is removed when images enter the system.
 //!
-//! [`Camera::check`] refuses numbers that are no camera, [`Camera::check_lens`] a camera that no lens makes, and
-//! [`Camera::check_whole_image`] one that is not that of a whole image: intrinsics in a wrong unit or of another resolution.
+//! [`Camera::check`] refuses invalid numbers, [`Camera::check_lens`] a camera that no real lens has, and
+//! [`Camera::check_whole_image`] a camera that cannot belong to a whole image, such as intrinsics in a wrong unit or for another
+//! resolution.
 //!
-//! Distortion after Brown (1966) with the coefficients `k1 k2 p1 p2 k3` in OpenCV's order. Only
-//! [`Camera::undistort_point`] and [`Camera::distort_point`] know it: everything behind the edge works with pinhole pixels.
+//! Distortion after Brown (1966) with the coefficients `k1 k2 p1 p2 k3` in OpenCV's order. Only [`Camera::undistort_point`] and
+//! [`Camera::distort_point`] use them; all other code works with pinhole pixels.
 
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
 use crate::{Mat3, Rect, Vec2, Vec3};
 
-/// No edge of an image lies further from the optical axis than this, degrees: a centred image sees up to twice of it. A pinhole
-/// image of more has no finite size at 90.
+/// Largest angle between an image edge and the optical axis, degrees: the field of view of a centred image is up to twice this
+/// angle. At 90 degrees a pinhole image would be infinitely large.
 const MAX_OFF_AXIS: f64 = 85.0;
 /// Largest ratio of the focal lengths, either way: pixels of sensors are square, and images are rarely stretched by more.
 const MAX_RATIO: f64 = 2.0;
-/// Longest focal length, pixels: a telescope's. A pixel of it sees a micrometre at a metre.
+/// Longest focal length, pixels: a telescope's. One of its pixels covers a micrometre at a metre.
 const MAX_FOCAL_LENGTH: f64 = 1e6;
-/// Smallest field of view along the longer side of a whole image, degrees: a lens of 2 metres before a full-frame sensor.
+/// Smallest field of view along the longer side of a whole image, degrees: a lens of 2 metres in front of a full-frame sensor.
 const MIN_FIELD_OF_VIEW: f64 = 1.0;
 /// The principal point of a whole image lies within this part of its width and height.
 const CENTRE: std::ops::RangeInclusive<f64> = 0.1..=0.9;
-/// A principal point nearer than this to one corner, in width and in height, is the centre of a smaller (left and top) image.
+/// A principal point nearer than this to one corner, as a fraction of width and of height, belongs to an image of another
+/// resolution: a smaller one if the corner is at the top left.
 const CORNER: f64 = 0.35;
-/// A lens moves the middle of an image's edge by no more than this factor, towards or away from the optical axis.
+/// Largest factor by which a lens moves the middle of an image's edge towards or away from the optical axis.
 const MAX_DISTORTION: f64 = 5.0;
-/// Most pixels of an image that a camera is for: what is rendered for it takes 8 bytes a pixel.
+/// Maximum number of pixels of a camera's image: a rendering takes 8 bytes per pixel.
 const MAX_PIXELS: usize = 1 << 28;
 
 /// Why a camera is not usable.
@@ -38,9 +40,9 @@ pub enum CameraError {
     Field {
         /// Name of the field.
         field: &'static str,
-        /// What it held.
+        /// Its value.
         found: f64,
-        /// What it should hold.
+        /// The expected value.
         expected: &'static str,
     },
     /// No lens has these parameters, or not with an image of this size.
@@ -48,9 +50,9 @@ pub enum CameraError {
     Implausible {
         /// Names of the fields.
         fields: &'static str,
-        /// What they hold and what that would mean.
+        /// Their values and what these would imply.
         found: String,
-        /// What they should hold.
+        /// The expected values.
         expected: &'static str,
         /// What to do.
         advice: &'static str,
@@ -89,7 +91,7 @@ pub struct BrownConrady {
 }
 
 impl CameraError {
-    /// Names the image's size in what was found.
+    /// Adds the image's size to the value that the error reports.
     fn of_image(mut self, camera: &Camera) -> Self {
         if let CameraError::Implausible { found, .. } = &mut self {
             found.push_str(&format!(" for an image of {}x{}", camera.width, camera.height));
@@ -318,7 +320,7 @@ impl Camera {
         Ok(())
     }
 
-    /// What a focal length that is far too short may be.
+    /// Advice about the possible unit of a focal length that is far too short.
     fn unit_advice(&self) -> &'static str {
         let longest = self.fx.max(self.fy);
         if longest < 10.0 && self.cx.abs() <= 2.0 && self.cy.abs() <= 2.0 {
@@ -353,12 +355,12 @@ impl Camera {
             .then(|| Vec2::new(self.fx * point.x / point.z + self.cx, self.fy * point.y / point.z + self.cy))
     }
 
-    /// The point in the camera frame that is seen at a pinhole pixel at `depth` metres along the axis.
+    /// The point in the camera frame that projects to a pinhole pixel, at `depth` metres along the optical axis.
     pub fn unproject(&self, pixel: &Vec2, depth: f64) -> Vec3 {
         Vec3::new((pixel.x - self.cx) / self.fx * depth, (pixel.y - self.cy) / self.fy * depth, depth)
     }
 
-    /// Where the raw, distorted image shows what a pinhole would show at `pixel`.
+    /// The pixel of the raw, distorted image for a pinhole pixel.
     pub fn distort_point(&self, pixel: &Vec2) -> Vec2 {
         match &self.distortion {
             None => *pixel,
@@ -381,7 +383,7 @@ impl Camera {
         }
     }
 
-    /// The same camera without its distortion: what an undistorted image was taken with.
+    /// The same camera without distortion: the camera of the undistorted image.
     pub fn without_distortion(&self) -> Camera {
         Camera { distortion: None, ..*self }
     }
@@ -478,7 +480,7 @@ mod tests {
             assert!(error.contains(words) && error.contains("field"), "{error}");
             assert!(camera.check_whole_image().is_err());
         }
-        // Full-HD intrinsics for a VGA image and the other way round, a telescope.
+        // Full-HD intrinsics for a VGA image and vice versa, a telescope.
         for camera in [
             of(1390.5, 1387.0, 965.0, 522.6),
             of(572.4, 573.6, 325.3, 242.0).crop(&Rect { x: 0.0, y: 0.0, width: 1920.0, height: 1080.0 }),
@@ -499,7 +501,7 @@ mod tests {
         let of = |f: f64, w: usize, h: usize| {
             Camera::new(f, f, (w as f64 - 1.0) / 2.0, (h as f64 - 1.0) / 2.0, w, h).unwrap()
         };
-        // 165 degrees wide; a lens of 600 mm before a sensor of 36 mm; 1024 pixels at 1.2 degrees; a bin-picking camera.
+        // 165 degrees wide; a lens of 600 mm in front of a sensor of 36 mm; 1024 pixels at 1.2 degrees; a bin-picking camera.
         for camera in
             [of(42.2, 640, 480), of(100_000.0, 6000, 4000), of(48_900.0, 1024, 768), of(2992.6, 1280, 960)]
         {

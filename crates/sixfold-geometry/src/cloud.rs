@@ -1,10 +1,10 @@
-//! Point clouds, where they come from (depth images) and how they are thinned (voxel grid).
+//! Point clouds: made from depth images, downsampled on a voxel grid.
 
 use std::collections::HashMap;
 
 use crate::{Camera, DepthImage, NormalImage, Pose, Vec2, Vec3};
 
-/// Points in metres with unit normals, equally many or none.
+/// Points in metres, with one unit normal per point or none at all.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct PointCloud {
     /// Points in metres.
@@ -91,7 +91,7 @@ impl PointCloud {
             while at != END {
                 let group = &mut groups[at];
                 let alike = || group.first_normal.dot(&n) >= cosine;
-                // Normals that are not known are alike, or each would make a group that the others are held against.
+                // Unknown normals count as similar; otherwise each of them would start a group of its own.
                 let unknown = || !(n.norm_squared() > 0.0 || group.first_normal.norm_squared() > 0.0);
                 if !with_normals || alike() || unknown() {
                     group.point += p;
@@ -130,8 +130,8 @@ pub fn sphere_directions(n: usize) -> Vec<Vec3> {
         .collect()
 }
 
-/// A small, fast, seedless hasher: voxel keys come from our own data, so nobody can attack it, and the same
-/// input always gives the same order of work.
+/// A small, fast, seedless hasher: voxel keys come from our own data, so it needs no protection against attacks, and
+/// the same input always gives the same order of processing.
 #[derive(Default, Clone, Copy)]
 struct Mix(u64);
 type BuildMix = std::hash::BuildHasherDefault<Mix>;

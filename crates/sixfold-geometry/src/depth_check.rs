@@ -1,9 +1,9 @@
-//! Whether a depth image can be one of a tabletop scene in metres.
+//! Checks that a depth image can show a tabletop scene in metres.
 
 use crate::DepthImage;
 use thiserror::Error;
 
-/// Why a depth image is of no use.
+/// Why a depth image cannot be used.
 #[derive(Debug, Error, Clone, PartialEq)]
 pub enum DepthImageError {
     /// No pixel has depth.
@@ -14,7 +14,7 @@ pub enum DepthImageError {
         /// Pixels in the image.
         pixels: usize,
     },
-    /// All depth lies where no tabletop object can be.
+    /// All depth is outside the range of tabletop scenes.
     #[error(
         "the depth lies between {nearest:.4} m and {farthest:.4} m, outside 0.05 m to 20 m: is the depth scale wrong by a factor of 1000?"
     )]
@@ -29,7 +29,7 @@ pub enum DepthImageError {
 /// The image (metres) with 0 where depth is negative or not finite.
 ///
 /// # Errors
-/// [`DepthImageError`] when nothing is left, or all of it is nearer than 0.05 m or further than 20 m.
+/// [`DepthImageError`] when no depth is left, or all of it is nearer than 0.05 m or further than 20 m.
 pub fn usable_depth(depth: &DepthImage) -> Result<DepthImage, DepthImageError> {
     let depth = depth.map(|&z| if z > 0.0 && z.is_finite() { z } else { 0.0 });
     let valid = depth.as_slice().iter().copied().filter(|&z| z > 0.0);

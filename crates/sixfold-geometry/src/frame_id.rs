@@ -1,8 +1,8 @@
-//! Which image of a dataset: the ids of its scene and of the image in it.
+//! The identity of an image in a dataset: the ids of its scene and of the image in the scene.
 
 use serde::{Deserialize, Serialize};
 
-/// One image of a dataset, as BOP numbers them. Written as `scene/image` for people, as
+/// One image of a dataset, with BOP's ids. Written as `scene/image` for people, and as
 /// `{"scene_id": 2, "im_id": 36}` in JSON.
 ///
 /// ```

@@ -35,7 +35,7 @@ pub fn homography(pairs: &[(Vec2, Vec2)]) -> Option<Mat3> {
     (norm.is_finite() && norm > 0.0).then(|| map / norm)
 }
 
-/// Where a map takes a point; `None` for the horizon and what is behind it.
+/// The image of a point under a map; `None` for points on the horizon and behind it.
 pub fn apply(map: &Mat3, point: &Vec2) -> Option<Vec2> {
     let p = map * Vec3::new(point.x, point.y, 1.0);
     (p.z.abs() > 1e-12).then(|| Vec2::new(p.x / p.z, p.y / p.z))

@@ -1,8 +1,8 @@
 //! Point-to-plane ICP (Chen and Medioni 1992) with a rejection distance, coarse to fine.
 //!
-//! What a point is matched with is a [`CorrespondenceSource`]: a cloud behind a k-d tree ([`IndexedCloud`]), or
-//! a depth image looked up where the point projects ([`DepthTarget`], projective association, Blais and
-//! Levine 1995), measured or rendered.
+//! Correspondences come from a [`CorrespondenceSource`]: a cloud with a k-d tree ([`IndexedCloud`]), or a depth
+//! image read at the projection of the point ([`DepthTarget`], projective association, Blais and Levine 1995),
+//! measured or rendered.
 
 use thiserror::Error;
 
@@ -14,21 +14,21 @@ use crate::{Camera, DepthImage, NormalImage, PointCloud, Pose, Vec2, Vec3};
 #[derive(Debug, Error, Clone, PartialEq)]
 #[non_exhaustive]
 pub enum IcpError {
-    /// Too few points found a partner.
+    /// Too few points have a correspondence.
     #[error(
         "{found} of {points} points found a partner within {distance:.4} m, at least {needed} are needed: start from a better pose or raise the rejection distance"
     )]
     TooFewCorrespondences {
         /// Pairs found.
         found: usize,
-        /// Points that looked for one.
+        /// Number of source points used.
         points: usize,
         /// Rejection distance in metres.
         distance: f64,
         /// Pairs needed.
         needed: usize,
     },
-    /// The surface lets the object slide (a plane, a sphere): the pose is not fixed.
+    /// The object can slide on the surface (a plane, a sphere), so the pose is not determined.
     #[error("the correspondences do not fix all six degrees of freedom")]
     Degenerate,
     /// The target has no normals.
@@ -46,7 +46,7 @@ pub enum IcpError {
         option: &'static str,
         /// Its value.
         found: f64,
-        /// What it should be.
+        /// The expected value.
         expected: &'static str,
     },
 }
@@ -56,13 +56,13 @@ pub enum IcpError {
 pub struct IcpLevel {
     /// Pairs further apart than this are left out, metres.
     pub rejection_distance: f64,
-    /// Most iterations on this level.
+    /// Maximum number of iterations on this level.
     pub iterations: usize,
     /// Every n-th source point is used.
     pub stride: usize,
 }
 
-/// How to align.
+/// Options of the alignment.
 #[derive(Debug, Clone, PartialEq)]
 pub struct IcpOptions {
     /// The levels, coarse first.
@@ -71,7 +71,7 @@ pub struct IcpOptions {
     pub max_angle: f64,
     /// A level ends when a step is smaller than this (metres and radians).
     pub convergence: f64,
-    /// Fewest pairs.
+    /// Minimum number of pairs.
     pub min_correspondences: usize,
 }
 
@@ -115,7 +115,7 @@ impl IcpOptions {
     }
 }
 
-/// What came out.
+/// The result of an alignment.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct IcpReport {
     /// The pose that maps the source onto the target.
@@ -132,11 +132,11 @@ pub struct IcpReport {
 
 /// Finds the target point for a source point that was moved into the target's frame.
 pub trait CorrespondenceSource {
-    /// The partner's point and unit normal; `None` when there is none within `max_distance` metres.
+    /// Point and unit normal of the correspondence; `None` when there is none within `max_distance` metres.
     fn partner(&self, point: &Vec3, max_distance: f64) -> Option<(Vec3, Vec3)>;
 }
 
-/// A cloud with normals behind a k-d tree.
+/// A cloud with normals and a k-d tree over its points.
 #[derive(Debug)]
 pub struct IndexedCloud {
     cloud: PointCloud,
@@ -175,7 +175,7 @@ impl CorrespondenceSource for IndexedCloud {
     }
 }
 
-/// A depth image with normals, measured or rendered: a point's partner is what its pixel shows.
+/// A depth image with normals, measured or rendered: a point corresponds to the surface at its pixel.
 #[derive(Debug, Clone, Copy)]
 pub struct DepthTarget<'a> {
     /// Depth in metres.

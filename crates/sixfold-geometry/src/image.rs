@@ -45,8 +45,8 @@ pub type Mask = Image<bool>;
 pub type RgbImage = Image<[u8; 3]>;
 /// Unit surface normals in the camera frame, pointing to the camera; `[0, 0, 0]` where unknown.
 pub type NormalImage = Image<[f32; 3]>;
-/// A 3D point per pixel, in metres; what frame it is in, and what marks a missing pixel, is said
-/// where the image is made.
+/// A 3D point per pixel, in metres; the function that makes the image documents its frame and the value of
+/// missing pixels.
 pub type PointImage = Image<[f32; 3]>;
 
 impl<T: Clone> Image<T> {
@@ -105,7 +105,7 @@ impl<T> Image<T> {
         &self.data
     }
 
-    /// All pixels, row by row, to be changed.
+    /// All pixels, row by row, mutable.
     pub fn as_mut_slice(&mut self) -> &mut [T] {
         &mut self.data
     }
@@ -144,7 +144,7 @@ impl Image<bool> {
         (x1 > x0).then(|| [x0, y0, x1 - x0, y1 - y0])
     }
 
-    /// The mask with all pixels that lie at most so many columns and rows from one of its own.
+    /// The mask dilated by a square: all pixels at most `pixels` columns and rows from a pixel of the mask.
     pub fn grown(&self, pixels: usize) -> Image<bool> {
         let spread = |line: &[bool]| -> Vec<bool> {
             let mut near = vec![false; line.len()];
@@ -182,8 +182,8 @@ impl<T> std::ops::IndexMut<(usize, usize)> for Image<T> {
     }
 }
 
-/// An axis-parallel rectangle in pixels: `x, y` of the top left corner, width and height, as in BOP
-/// and COCO (`[x, y, w, h]`).
+/// An axis-aligned rectangle in pixels: `x, y` of the top left corner, width and height, as in BOP and COCO
+/// (`[x, y, w, h]`).
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct Rect {
     /// Left edge in pixels.
@@ -202,7 +202,7 @@ impl Rect {
         self.width.max(0.0) * self.height.max(0.0)
     }
 
-    /// The common part of two rectangles, if there is one.
+    /// The intersection of two rectangles; `None` if it is empty.
     pub fn intersect(&self, other: &Rect) -> Option<Rect> {
         let x = self.x.max(other.x);
         let y = self.y.max(other.y);

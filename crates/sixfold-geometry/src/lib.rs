@@ -1,8 +1,8 @@
 //! Poses, cameras, images, absolute orientation, PnP and registration.
 //!
-//! Conventions of the whole house: lengths in metres, angles in radians, poses in `f64` and named by
-//! their spaces (`camera_from_object`), the OpenCV camera frame (x right, y down, z forward), pixel
-//! centres at whole numbers (the centre of the top left pixel is `(0, 0)`).
+//! Conventions of all crates: lengths in metres, angles in radians, poses in `f64` and named by their spaces
+//! (`camera_from_object`), the OpenCV camera frame (x right, y down, z forward), pixel centres at whole
+//! numbers (the centre of the top left pixel is `(0, 0)`).
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
 #![warn(unreachable_pub, unnameable_types)]

@@ -6,13 +6,14 @@
 //! by arithmetic.
 //!
 //! Searches are exact to the last bit: the distance to a cell is added up in the same order as that to a point, and
-//! rounding is monotone, so no cell with a nearer point in it is passed over.
+//! rounding is monotone, so no cell that contains a nearer point is skipped.
 
 use std::ops::Range;
 
 use crate::Vec3;
 
-/// The most points in a bucket. Fewer make the tree deeper, more make a search look at more points in vain.
+/// Maximum number of points in a bucket. A smaller bucket makes the tree deeper; a larger one makes searches test more
+/// points in vain.
 const BUCKET: usize = 32;
 
 /// A k-d tree over points in metres.
@@ -40,7 +41,7 @@ struct Bounds {
 /// A point and its index in the caller's list.
 type Entry = ([f64; 3], usize);
 
-/// Where a cell is cut in two.
+/// An inner node: the split of a cell in two.
 #[derive(Debug, Clone, Copy)]
 struct Node {
     axis: usize,
@@ -50,7 +51,7 @@ struct Node {
     lowest: [usize; 2],
 }
 
-/// A neighbour: its index in the list the tree was built from, and how far it is.
+/// A neighbour: its index in the list the tree was built from, and its distance.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Neighbour {
     /// Index of the point.
@@ -83,8 +84,8 @@ impl KdTree {
         tree
     }
 
-    /// Sorts `entries`, which lie in the cell `bounds`, into `buckets` and fills the nodes above them; the lowest index
-    /// among the entries.
+    /// Sorts `entries`, which lie in the cell `bounds`, into `buckets` and fills the nodes above them; returns the lowest
+    /// index among the entries.
     fn build(&mut self, node: usize, buckets: Range<usize>, bounds: Bounds, entries: &mut [Entry]) -> usize {
         if buckets.len() == 1 {
             return entries.iter().map(|e| e.1).min().unwrap_or(usize::MAX);
@@ -93,7 +94,8 @@ impl KdTree {
         let axis = (1..3).fold(0, |longest, axis| if side(axis) > side(longest) { axis } else { longest });
         let middle = buckets.start + buckets.len() / 2;
         let first = self.start(middle) - self.start(buckets.start);
-        // Equal coordinates go by index: equal points then make a tree over their indices, which is quick to search.
+        // Equal coordinates are sorted by index, so that equal points form a tree over their indices, which is quick to
+        // search.
         let order = |a: &Entry, b: &Entry| a.0[axis].total_cmp(&b.0[axis]).then(a.1.cmp(&b.1));
         let cut = entries.select_nth_unstable_by(first, order).1.0[axis];
         let (left, right) = entries.split_at_mut(first);
@@ -113,8 +115,8 @@ impl KdTree {
         (bucket * self.original.len()) >> self.depth
     }
 
-    /// The nearest point, of equally near ones that of the lowest index; `None` when the tree is empty or `p` is not
-    /// finite.
+    /// The nearest point (the one with the lowest index among equally near ones); `None` when the tree is empty or `p` is
+    /// not finite.
     pub fn nearest(&self, p: &Vec3) -> Option<Neighbour> {
         let p = finite(p).filter(|_| !self.original.is_empty())?;
         let mut search = Nearest { squared: f64::INFINITY, index: usize::MAX };
@@ -122,8 +124,9 @@ impl KdTree {
         Some(Neighbour { index: search.index, distance: search.squared.sqrt() })
     }
 
-    /// The `count` nearest points (all, where there are fewer), the nearest first, of equally near ones those of the lowest
-    /// indices. The time grows with `count` times the logarithm of the points, however many of them are equal.
+    /// The `count` nearest points (all, if there are fewer), the nearest first; among equally near points, those with the
+    /// lowest indices. The time grows with `count` times the logarithm of the number of points, even if many of them are
+    /// equal.
     pub fn nearest_several(&self, p: &Vec3, count: usize) -> Vec<Neighbour> {
         let Some(p) = finite(p).filter(|_| count > 0 && !self.original.is_empty()) else {
             return vec![];
@@ -144,8 +147,8 @@ impl KdTree {
         search.found
     }
 
-    /// Shows `search` the points of the cells under `node` that it wants to look into, the nearer child first. `off` is
-    /// the distance from `p` to the cell along each axis, 0 where `p` is within its bounds.
+    /// Passes `search` the points of the cells under `node` that it can reach, the nearer child first. `off` is the
+    /// distance from `p` to the cell along each axis, 0 where `p` is within its bounds.
     fn search(&self, p: &[f64; 3], search: &mut impl Search, node: usize, off: [f64; 3]) {
         let Some(inner) = self.nodes.get(node) else {
             let bucket = node - self.nodes.len();
@@ -161,7 +164,8 @@ impl KdTree {
             return;
         };
         let difference = p[inner.axis] - inner.cut;
-        // Of two cells equally far away that with the lowest index first: of many equal points only a few are then visited.
+        // Of two equally distant cells, the one with the lowest index is searched first, so that of many equal points only
+        // a few are visited.
         let near = if difference.abs() == off[inner.axis].abs() {
             usize::from(inner.lowest[1] < inner.lowest[0])
         } else {
@@ -183,9 +187,9 @@ impl Bounds {
     }
 }
 
-/// What a search wants to see and does with it; distances are squared.
+/// A kind of search: the cells that it visits and what it does with their points. Distances are squared.
 trait Search {
-    /// Whether to look into a cell as far away as this, with no index lower than this.
+    /// Whether to visit a cell at this distance whose lowest index is this.
     fn reaches(&self, squared: f64, lowest: usize) -> bool;
     /// Takes a point.
     fn point(&mut self, squared: f64, index: usize);
@@ -256,7 +260,7 @@ fn finite(p: &Vec3) -> Option<[f64; 3]> {
     p.iter().all(|c| c.is_finite()).then_some([p.x, p.y, p.z])
 }
 
-/// The one order of additions that all comparisons of distances rest on.
+/// All comparisons of distances depend on this one order of additions.
 fn squared_length(v: &[f64; 3]) -> f64 {
     v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
 }
@@ -266,10 +270,10 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    /// The nearest of all points, the first of equally near ones.
+    /// The nearest of all points by full search; the first of equally near ones.
     fn full_search(points: &[Vec3], p: &Vec3) -> Neighbour {
         let squared = |q: &Vec3| squared_length(&[q.x - p.x, q.y - p.y, q.z - p.z]);
-        // Squares are compared, as in the tree: two of them may have one root.
+        // Squared distances are compared, as in the tree: different squares may have the same rounded root.
         let index = (0..points.len())
             .reduce(|best, i| if squared(&points[i]) < squared(&points[best]) { i } else { best });
         let index = index.unwrap();
@@ -338,7 +342,7 @@ mod tests {
         assert_eq!(same.nearest(&Vec3::zeros()), Some(Neighbour { index: 0, distance: 1.0 }));
         let lowest: Vec<usize> = same.nearest_several(&Vec3::x(), 12).iter().map(|n| n.index).collect();
         assert_eq!(lowest, (0..12).collect::<Vec<_>>());
-        // Nor are distances whose squares overflow.
+        // Squared distances that overflow are handled too.
         let far = KdTree::new(&[Vec3::x() * 1e300, Vec3::y() * 1e300]);
         assert_eq!(far.nearest(&Vec3::zeros()), Some(Neighbour { index: 0, distance: f64::INFINITY }));
     }

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 
 use crate::{Camera, DepthImage, Image, NormalImage, OptionError, Vec3};
 
-/// How normals are computed.
+/// Options of the computation of normals.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct NormalOptions {
     /// Half width of the window in pixels.
@@ -35,7 +35,7 @@ impl NormalOptions {
     }
 }
 
-/// Unit normals in the camera frame, turned to the camera; zero where depth is missing or fewer than six
+/// Unit normals in the camera frame, pointing to the camera; zero where depth is missing or fewer than six
 /// neighbours lie on the same surface.
 ///
 /// # Panics
@@ -52,7 +52,7 @@ pub fn normals_from_depth(depth: &DepthImage, camera: &Camera, options: &NormalO
                 continue;
             }
             let limit = (options.max_relative_step * f64::from(z)) as f32;
-            // Sums for the plane dz = gx dx + gy dy + c, where c takes up the noise of the centre pixel.
+            // Sums for the plane dz = gx dx + gy dy + c, where c absorbs the noise of the centre pixel.
             let (mut n, mut sx, mut sy, mut sz) = (0f32, 0f32, 0f32, 0f32);
             let (mut xx, mut xy, mut yy, mut xz, mut yz) = (0f32, 0f32, 0f32, 0f32, 0f32);
             let y_low = (y as isize - radius).max(0);
@@ -105,8 +105,8 @@ pub fn normals_from_depth(depth: &DepthImage, camera: &Camera, options: &NormalO
 }
 
 /// Fills missing depth from surrounding pixels: in each round every missing pixel with valid neighbours
-/// (8-neighbourhood) takes their mean, at most `rounds` rounds, so holes up to `2 * rounds` pixels wide close
-/// (dissertation, section 5.3.1).
+/// (8-neighbourhood) takes their mean, for at most `rounds` rounds, so holes up to `2 * rounds` pixels wide
+/// are closed (dissertation, section 5.3.1).
 pub fn inpaint_depth(depth: &DepthImage, rounds: usize) -> DepthImage {
     let (width, height) = depth.size();
     let mut current = depth.map(|&z| if z > 0.0 && z.is_finite() { z } else { 0.0 });

@@ -1,4 +1,4 @@
-//! The error of an option that is out of its range, and the conditions by which option structs are checked.
+//! The error for an option that is out of its range, and checks for option structs.
 
 use std::fmt::Display;
 use std::ops::RangeBounds;
@@ -9,11 +9,11 @@ use thiserror::Error;
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
 #[error("option {option}: found {found}, expected {expected}")]
 pub struct OptionError {
-    /// Its name, that of its struct before it where it lies in another: `voting.bin_margin`.
+    /// Its name, with the field of a nested struct in front: `voting.bin_margin`.
     pub option: &'static str,
-    /// What it holds.
+    /// Its value.
     pub found: String,
-    /// What it may hold.
+    /// The allowed values.
     pub expected: &'static str,
 }
 
@@ -23,7 +23,7 @@ impl OptionError {
         OptionError { option, found: found.to_string(), expected }
     }
 
-    /// This error unless `value` lies within `range`; no range with a bound holds NaN.
+    /// This error unless `value` is within `range`; NaN is outside every range with a bound.
     ///
     /// # Errors
     /// [`OptionError`].

@@ -30,14 +30,14 @@ impl Plane {
     }
 }
 
-/// How the plane is searched.
+/// Options of the search for a plane.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PlaneOptions {
     /// A point within this distance belongs to the plane, metres.
     pub threshold: f64,
     /// Number of random samples.
     pub iterations: usize,
-    /// The plane must hold at least this fraction of the points.
+    /// Minimum fraction of the points on the plane.
     pub min_share: f64,
     /// Normals, where the cloud has them, must agree within this angle, radians.
     pub max_angle: f64,
@@ -64,15 +64,15 @@ impl PlaneOptions {
     }
 }
 
-/// The plane that holds most of the cloud's points, its normal turned to the origin (the camera);
-/// `None` when no plane holds the asked fraction.
+/// The plane with the most points of the cloud, its normal pointing to the origin (the camera); `None` when
+/// no plane has the required fraction.
 pub fn dominant_plane(cloud: &PointCloud, options: &PlaneOptions, seed: u64) -> Option<Plane> {
     let n = cloud.len();
     if n < 3 {
         return None;
     }
     let mut random = ChaCha8Rng::seed_from_u64(seed);
-    // Counting on every n-th point is enough to choose; the fit at the end uses all.
+    // Every n-th point is enough to choose a plane; the final fit uses all points.
     let stride = (n / 4000).max(1);
     let belongs = |plane: &Plane, i: usize| {
         plane.distance(&cloud.points[i]).abs() < options.threshold

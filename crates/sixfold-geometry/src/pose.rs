@@ -1,7 +1,7 @@
 //! Rigid transformations in SE(3), in `f64`, with exponential and logarithm.
 //!
-//! The twist of [`Pose::exp`] is `(v, w)`: translation part first, then the rotation vector. Formulas
-//! after Barfoot, *State Estimation for Robotics* (2017), section 7.1.
+//! The twist of [`Pose::exp`] is `(v, w)`: translation part first, then the rotation vector. Formulas from Barfoot,
+//! *State Estimation for Robotics* (2017), section 7.1.
 
 use std::ops::Mul;
 
@@ -24,7 +24,7 @@ pub enum PoseError {
         orthogonality: f64,
         /// The determinant of `R`.
         determinant: f64,
-        /// What was accepted.
+        /// The tolerance.
         tolerance: f64,
     },
     /// A number is NaN or infinite.
@@ -61,11 +61,11 @@ impl Default for Pose {
 }
 
 impl Pose {
-    /// Largest deviation of `R^T R` from the identity that [`Pose::from_parts`] takes: the published ground truth of
-    /// LM-O holds rotations that are off by 0.009.
+    /// Largest deviation of `R^T R` from the identity that [`Pose::from_parts`] accepts: the published ground truth
+    /// of LM-O contains rotations that deviate by 0.009.
     pub const ROTATION_TOLERANCE: f64 = 2e-2;
 
-    /// The transformation that changes nothing.
+    /// The identity transformation.
     pub fn identity() -> Self {
         Pose(Isometry3::identity())
     }
@@ -75,12 +75,13 @@ impl Pose {
         Pose(Isometry3::from_parts(Translation3::from(translation), rotation))
     }
 
-    /// From a translation in metres alone.
+    /// A pure translation, in metres.
     pub fn from_translation(translation: Vec3) -> Self {
         Pose::new(UnitQuaternion::identity(), translation)
     }
 
-    /// From a rotation matrix and a translation in metres; a rotation off by rounding is made exact.
+    /// From a rotation matrix and a translation in metres; a rotation with rounding errors is replaced by the
+    /// nearest exact one.
     ///
     /// # Errors
     /// [`PoseError`] when a number is not finite or `rotation` is further from a rotation than
@@ -282,7 +283,7 @@ mod tests {
 
     #[test]
     fn exp_of_a_screw_by_hand() {
-        // A quarter turn about z with v = (1, 0, 0) moves the origin to (2/pi, 2/pi, 0).
+        // A rotation by 90 degrees about z with v = (1, 0, 0) moves the origin to (2/pi, 2/pi, 0).
         let half_pi = std::f64::consts::FRAC_PI_2;
         let p = Pose::exp(&Vector6::new(1.0, 0.0, 0.0, 0.0, 0.0, half_pi));
         let expected = Vec3::new(1.0 / half_pi, 1.0 / half_pi, 0.0);

@@ -1,12 +1,13 @@
-//! The one way in which a long function of any crate says how far it is, and hears whether to go on.
+//! Progress of long functions in all crates: they report how far they are and can be asked to stop.
 
-/// Receives how far a function is. Closures `|done, total| -> bool` are one, and `()` is one that nobody looks at.
+/// Receives the progress of a function. It is implemented for closures `|done, total| -> bool`, and for `()`, which ignores all
+/// reports.
 ///
-/// Functions that work in parallel report from any of their threads, each part once it is done; the numbers may then arrive in
-/// another order. What such a function returns does not depend on who listens, as long as nobody stops it.
+/// Parallel functions report from any of their threads, each part once it is done, so numbers may arrive out of order. The
+/// result of a function does not depend on the receiver unless the receiver stops it.
 pub trait Progress: Sync {
-    /// `done` of `total` parts are done. `false` stops the function at its next whole part; its documentation says what it then
-    /// returns.
+    /// `done` of `total` parts are done. Returning `false` stops the function after its current part; its documentation states
+    /// what it then returns.
     fn report(&self, done: usize, total: usize) -> bool;
 }
 

@@ -1,9 +1,9 @@
-//! Random numbers: one ChaCha stream per sample, so that a sample is a function of seed and number alone.
+//! Random numbers: one ChaCha stream per sample, so that a sample depends only on the seed and its number.
 
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-/// The generator of the whole house.
+/// The random generator of all crates.
 pub type Random = ChaCha8Rng;
 
 /// The generator of sample `number` under `seed`: the same numbers on any thread and machine.
@@ -13,7 +13,7 @@ pub fn stream(seed: u64, number: u64) -> Random {
     random
 }
 
-/// Uniform between the two ends of `range`; its first end where they are equal or not in order.
+/// Uniform between the two ends of `range`; the first end if they are equal or not in order.
 pub fn uniform(random: &mut Random, range: [f32; 2]) -> f32 {
     range[0] + (range[1] - range[0]).max(0.0) * random.random::<f32>()
 }

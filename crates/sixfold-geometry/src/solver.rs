@@ -66,8 +66,8 @@ impl NormalEquations {
         (h, Vector6::from(self.g))
     }
 
-    /// The step that lowers the cost, damped by `lambda` (0 for Gauss-Newton); `None` when the residuals do
-    /// not hold all six degrees of freedom.
+    /// The step that lowers the cost, damped by `lambda` (0 for Gauss-Newton); `None` when the residuals do not determine
+    /// all six degrees of freedom.
     pub fn solve(&self, lambda: f64) -> Option<Vector6<f64>> {
         let (mut h, g) = self.parts();
         for i in 0..6 {

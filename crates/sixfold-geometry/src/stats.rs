@@ -1,19 +1,19 @@
 //! Statistics of a few numbers.
 
-/// The median: the middle value, or the mean of the two in the middle; `None` without values. Reorders them.
+/// The median: the middle value, or the mean of the two middle ones; `None` without values. Reorders the values.
 pub fn median(values: &mut [f64]) -> Option<f64> {
     let count = values.len();
     let upper = upper_median(values)?;
     if count % 2 == 1 {
         return Some(upper);
     }
-    // The rank selection has put all smaller ones before it.
+    // The rank selection has put all smaller values before it.
     let lower = values[..count / 2].iter().copied().max_by(f64::total_cmp)?;
     Some(0.5 * (lower + upper))
 }
 
-/// The value of rank `count / 2`, counted from zero in ascending order: one of the values, with an even number of them the
-/// upper of the two in the middle; `None` without values. Reorders them.
+/// The value of rank `count / 2`, counted from zero in ascending order: always one of the values, the upper of the two
+/// middle ones if their number is even; `None` without values. Reorders the values.
 pub fn upper_median(values: &mut [f64]) -> Option<f64> {
     if values.is_empty() {
         return None;
@@ -22,7 +22,7 @@ pub fn upper_median(values: &mut [f64]) -> Option<f64> {
     Some(*values.select_nth_unstable_by(middle, f64::total_cmp).1)
 }
 
-/// The logistic function of a network's output: between 0 and 1.
+/// The logistic function, for a network's output: between 0 and 1.
 #[inline]
 pub fn sigmoid(x: f32) -> f32 {
     1.0 / (1.0 + (-x).exp())

@@ -1,13 +1,14 @@
-//! Undoing lens distortion of whole images, at the edge of the system: behind it every image is a pinhole image.
+//! Removal of lens distortion from whole images when they enter the system: from then on every image is a pinhole image.
 //!
-//! Every pinhole pixel looks up where the raw image shows it (Brown 1966); nothing is inverted.
+//! The distorted position of every pinhole pixel is computed (Brown 1966) and the raw image is read there; the distortion
+//! is not inverted.
 
 use rayon::prelude::*;
 
 use crate::{Camera, CameraError, DepthImage, Image, Rect, RgbImage, Vec2};
 
-/// The depth image a pinhole camera with the same intrinsics would have measured: the nearest raw pixel, because a mean
-/// over a depth edge is a point that does not exist. Missing where the raw image shows nothing.
+/// The depth image that a pinhole camera with the same intrinsics would have measured. Takes the nearest raw pixel, because
+/// a mean across a depth edge is a point that does not exist. Depth is missing outside the raw image.
 ///
 /// # Errors
 /// [`CameraError::Resolution`] when the image does not belong to the camera.
@@ -18,8 +19,8 @@ pub fn undistort_depth(raw: &DepthImage, camera: &Camera) -> Result<DepthImage, 
     })
 }
 
-/// The colour image a pinhole camera with the same intrinsics would have taken: bilinear, black where the raw image
-/// shows nothing.
+/// The colour image that a pinhole camera with the same intrinsics would have taken, interpolated bilinearly; black outside
+/// the raw image.
 ///
 /// # Errors
 /// [`CameraError::Resolution`] when the image does not belong to the camera.
@@ -43,7 +44,8 @@ pub fn undistort_rgb(raw: &RgbImage, camera: &Camera) -> Result<RgbImage, Camera
     })
 }
 
-/// The box that holds what a box of the raw image shows, in the pinhole image: found from its border and inside, 25 points.
+/// The box in the pinhole image that contains the content of a box in the raw image, computed from 25 points on its border
+/// and inside.
 pub fn undistort_box(region: &Rect, lens: &Camera) -> Rect {
     if lens.distortion.is_none() {
         return *region;
@@ -94,7 +96,7 @@ mod tests {
 
     #[test]
     fn a_smooth_raw_image_becomes_the_pinhole_image() {
-        // What the scene shows along a ray; the raw image shows it at the distorted pixel.
+        // The colour of the scene along a ray; the raw image has it at the distorted pixel.
         let color = |p: &Vec2| {
             [128.0 + 0.6 * (p.x - 80.0), 128.0 + 0.9 * (p.y - 60.0), 100.0].map(|v: f64| v.round() as u8)
         };

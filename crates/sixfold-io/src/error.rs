@@ -1,4 +1,4 @@
-//! What can be wrong with one image file: every message names the file, what was found and expected, and what to do.
+//! Errors of image files: every message names the file, the values found and expected, and what to do.
 
 use std::path::PathBuf;
 
@@ -12,7 +12,7 @@ pub enum ImageFileError {
     Read {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
     /// The system could not write it.
@@ -20,10 +20,10 @@ pub enum ImageFileError {
     Write {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
-    /// It cannot be decoded, or holds pixels of another kind.
+    /// It cannot be decoded, or has another kind of pixels.
     #[error("{}: not a readable image: {reason}; get the file again or remove it", path.display())]
     Content {
         /// The file.
@@ -31,7 +31,7 @@ pub enum ImageFileError {
         /// What is wrong.
         reason: String,
     },
-    /// It is an image, but no mask, or which pixels are the mask is not clear.
+    /// It is an image but not a mask, or it is not clear which pixels belong to the mask.
     #[error("{}: mask: {reason}", path.display())]
     Mask {
         /// The file.
@@ -52,12 +52,12 @@ pub enum ImageFileError {
         expected: (usize, usize),
         /// Width and height found.
         found: (usize, usize),
-        /// Where the expectation comes from.
+        /// The source of the expected size.
         size_from: String,
     },
 }
 
-/// What the system said; for who names the file in an error of its own.
+/// The system's error, for callers that name the file in their own error.
 impl From<ImageFileError> for std::io::Error {
     fn from(error: ImageFileError) -> Self {
         match error {

@@ -1,5 +1,6 @@
-//! Writing whole files: nothing is ever seen half-written, what a killed writer leaves behind goes with the next write, and what
-//! was written is there after a power failure, contents and name (`fsync` of the file before it is renamed, of its folder after).
+//! Atomic writes of whole files. Readers never see a partly written file, the leftovers of a killed writer are removed by the next
+//! write, and a written file survives a power failure with contents and name (`fsync` of the file before it is renamed, and of its
+//! folder after).
 
 use std::fs::{self, File, TryLockError};
 use std::io::ErrorKind::{InvalidInput, PermissionDenied, Unsupported};
@@ -9,21 +10,20 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use crate::lock::still_there;
 
-/// Writes `bytes` to a temporary file beside `path` and renames it: readers see the old or the new file. Folders on the way
-/// are made.
+/// Writes `bytes` to a temporary file beside `path` and renames it: readers get the old file or the new one. Missing parent
+/// folders are created.
 ///
 /// # Errors
-/// What the system says; the temporary file is then removed and what stood at `path` before is unchanged, unless it was the folder
-/// that could not be handed to the disk.
+/// The system's error. The temporary file is then removed and `path` is unchanged, unless only the sync of the folder failed.
 pub fn write_atomically(path: &Path, bytes: &[u8]) -> io::Result<()> {
     make_folder_of(path)?;
     write_atomically_with(path, |file| file.write_all(bytes))
 }
 
-/// Makes the folder that `path` lies in, with those on the way, and hands their names to the disk.
+/// Creates the folder of `path` with its missing parents, and syncs their names to the disk.
 ///
 /// # Errors
-/// What the system says.
+/// The system's error.
 pub fn make_folder_of(path: &Path) -> io::Result<()> {
     let Some(parent) = path.parent().filter(|p| !p.as_os_str().is_empty()) else { return Ok(()) };
     let missing: Vec<&Path> =
@@ -35,12 +35,11 @@ pub fn make_folder_of(path: &Path) -> io::Result<()> {
     missing.into_iter().rev().try_for_each(sync_folder_of)
 }
 
-/// Hands the name of a file or folder that was made or renamed to the disk, which is kept in the folder that it lies in: after a
-/// power failure it is there under that name. Where folders cannot be handed over (Windows, some network file systems) that is up
-/// to the system.
+/// Syncs the folder of a file or folder that was created or renamed, so that its name survives a power failure. Where folders
+/// cannot be synced (Windows, some network file systems) this depends on the system.
 ///
 /// # Errors
-/// What the system says, such as that the disk is broken.
+/// The system's error, such as a broken disk.
 pub fn sync_folder_of(path: &Path) -> io::Result<()> {
     let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
     #[cfg(test)]
@@ -49,17 +48,17 @@ pub fn sync_folder_of(path: &Path) -> io::Result<()> {
         return Ok(());
     }
     match File::open(folder).and_then(|folder| folder.sync_all()) {
-        // A folder that may be written and not be read; a file system that knows no such request.
+        // A folder that can be written but not read, or a file system that does not support the request.
         Err(error) if matches!(error.kind(), InvalidInput | PermissionDenied | Unsupported) => Ok(()),
         result => result,
     }
 }
 
-/// As [`write_atomically`], with what `write` puts into the file, into a folder that is there already. A link stays, and what it
-/// leads to is written; a device or a pipe (`/dev/null`, `/dev/stdout`) is written as it is, not replaced.
+/// As [`write_atomically`], with the content from `write`, into an existing folder. A link is kept and its target is written; a
+/// device or a pipe (`/dev/null`, `/dev/stdout`) is written directly, not replaced.
 ///
 /// # Errors
-/// What the system or `write` says; as [`write_atomically`].
+/// The error of the system or of `write`, as for [`write_atomically`].
 pub fn write_atomically_with(
     path: &Path,
     write: impl FnOnce(&mut BufWriter<File>) -> io::Result<()>,
@@ -73,7 +72,7 @@ pub fn write_atomically_with(
     let path = linked.as_deref().unwrap_or(path);
     let (temporary, file) = temporary_beside(path)?;
     let mut file = BufWriter::new(file);
-    // The file stays open, and so locked, until it has its name: until then nobody takes it for left behind.
+    // The file stays open, and therefore locked, until it is renamed, so that no other process takes it for a leftover.
     let result = write(&mut file)
         .and_then(|()| file.flush())
         .and_then(|()| file.get_ref().sync_all())
@@ -99,22 +98,22 @@ fn temporary(path: &Path, number: usize) -> io::Result<PathBuf> {
     Ok(path.with_file_name(format!(".{}.{number}.tmp", name.to_string_lossy())))
 }
 
-/// An empty temporary file for `path`, locked: the first that no living writer holds, so that what a dead one left behind is used
-/// again rather than kept for ever.
+/// An empty, locked temporary file for `path`: the first one that no running writer holds, so that leftovers of killed writers are
+/// reused rather than kept for ever.
 fn temporary_beside(path: &Path) -> io::Result<(PathBuf, File)> {
     let mut number = 0;
     loop {
         let temporary = temporary(path, number)?;
         let file = File::options().read(true).write(true).create(true).truncate(false).open(&temporary)?;
         match file.try_lock() {
-            // Its holder may have renamed or removed it between opening and locking: then this is another file.
+            // Its holder may have renamed or removed it between opening and locking; then this is another file.
             Ok(()) if still_there(&file, &temporary) => {
                 file.set_len(0)?;
                 return Ok((temporary, file));
             }
             Ok(()) => {}
             Err(TryLockError::WouldBlock) => number += 1,
-            // A file system without locks: a name that nobody else has.
+            // A file system without locks: use a unique name.
             Err(TryLockError::Error(_)) => {
                 drop(fs::remove_file(&temporary));
                 return unshared(path);
@@ -123,7 +122,7 @@ fn temporary_beside(path: &Path) -> io::Result<(PathBuf, File)> {
     }
 }
 
-/// A temporary file under a name of this process and call.
+/// A temporary file under a name that is unique to this process and call.
 fn unshared(path: &Path) -> io::Result<(PathBuf, File)> {
     static COUNTER: AtomicU64 = AtomicU64::new(0);
     let number = COUNTER.fetch_add(1, Ordering::Relaxed);
@@ -133,7 +132,7 @@ fn unshared(path: &Path) -> io::Result<(PathBuf, File)> {
     Ok((temporary, file))
 }
 
-/// Removes what dead writers left of this target beyond the first temporary file, which the next write uses.
+/// Removes the leftovers of killed writers for this target, except the first temporary file, which the next write uses.
 fn remove_left_behind(path: &Path) {
     for number in 1.. {
         let Ok(temporary) = temporary(path, number) else { return };
@@ -151,7 +150,7 @@ mod tests {
     use super::*;
 
     thread_local! {
-        /// The folders that this thread handed to the disk.
+        /// The folders that this thread has synced.
         pub(super) static SYNCED: RefCell<Vec<PathBuf>> = const { RefCell::new(vec![]) };
     }
 
@@ -165,7 +164,7 @@ mod tests {
         assert_eq!(synced(), [root.to_owned(), root.join("a"), root.join("a/b")]);
         write_atomically(&root.join("a/b/record.json"), b"newer").unwrap();
         assert_eq!(synced(), [root.join("a/b")]);
-        // Nothing has a new name where nothing could be written.
+        // If nothing could be written, nothing is renamed.
         assert!(write_atomically_with(&root.join("other"), |_| Err(io::Error::other("no"))).is_err());
         assert!(synced().is_empty());
         sync_folder_of(Path::new("Cargo.toml")).unwrap();

@@ -1,12 +1,12 @@
-//! FNV-1a with 64 bits (Fowler, Noll, Vo): tells files and settings apart, the same on every machine. No protection against
-//! anybody who wants two to be equal.
+//! FNV-1a with 64 bits (Fowler, Noll, Vo): distinguishes files and settings, with the same value on every machine. It gives
+//! no protection against deliberate collisions.
 
 use std::io::{self, Read};
 use std::path::Path;
 
 use crate::regular::open_regular;
 
-/// A hash that grows with the bytes it is given.
+/// A hash that is updated with bytes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Fnv1a(u64);
 
@@ -17,14 +17,14 @@ impl Default for Fnv1a {
 }
 
 impl Fnv1a {
-    /// Takes in `bytes`: the same as one call for each of them.
+    /// Updates the hash with `bytes`; equivalent to one call per byte.
     pub fn write(&mut self, bytes: &[u8]) {
         for &b in bytes {
             self.0 = (self.0 ^ u64::from(b)).wrapping_mul(0x0000_0100_0000_01b3);
         }
     }
 
-    /// The hash of all that was given so far.
+    /// The hash of all bytes so far.
     pub fn value(&self) -> u64 {
         self.0
     }
@@ -40,7 +40,7 @@ pub fn fnv1a(bytes: &[u8]) -> u64 {
 /// The hash of a file's bytes, read piece by piece.
 ///
 /// # Errors
-/// What the system says; a folder, a pipe or a device is refused, as by [`open_regular`].
+/// The system's error; a folder, a pipe or a device is refused, as by [`open_regular`].
 pub fn fnv1a_of_file(path: &Path) -> io::Result<u64> {
     let mut file = open_regular(path, u64::MAX)?;
     let (mut hash, mut buffer) = (Fnv1a::default(), vec![0; 1 << 16]);

@@ -1,7 +1,7 @@
-//! Depth, masks and colour of image files: the one place where images are decoded, without trusting their headers.
+//! Depth, masks and colour from image files. Images are decoded only here, without trusting their headers.
 //!
-//! The size is read first and held against the limit in pixels; only then the pixels are decoded. What stands beside them in the file
-//! (text, colour profiles) may take [`BESIDE_PIXELS`] in all, which also bounds what is inflated from it.
+//! The size is read first and checked against the limit in pixels; only then are the pixels decoded. Other data in the file (text,
+//! colour profiles) may take [`BESIDE_PIXELS`] in all, which also limits its decompressed size.
 
 use std::borrow::Cow;
 use std::io::Cursor;
@@ -15,25 +15,25 @@ use crate::files::write_atomically;
 use crate::limit::{check_pixels, max_pixels};
 use crate::mask_pixels;
 
-/// Neither PNG nor JPEG packs more bytes of pixels than this into one byte of file. PNG's deflate packs 1032 bytes of equal values into
-/// one (zlib, "Maximum Compression Factor"), and a bit of a palette becomes up to four bytes.
+/// Neither PNG nor JPEG stores more bytes of pixels than this in one byte of the file. PNG's deflate packs 1032 bytes of equal
+/// values into one (zlib, "Maximum Compression Factor"), and a bit of a palette becomes up to four bytes.
 const LARGEST_EXPANSION: u64 = 1032 * 32;
 const LARGEST_SIDE: u32 = 1 << 15;
-/// Most bytes of what is no pixel: colour profiles take up to 4 MB.
+/// Maximum bytes of data other than pixels: colour profiles take up to 4 MB.
 const BESIDE_PIXELS: u64 = 32 << 20;
-/// Most bytes that a pixel takes, decoded: four channels of 16 bits. An image file of more bytes than that is no image.
+/// Maximum bytes of a decoded pixel: four channels of 16 bits. A file with more bytes per pixel is not accepted as an image.
 const BYTES_A_PIXEL: u64 = 8;
 
 /// Diagonal of 35 mm film (36 x 24 mm), millimetres.
 const FILM_DIAGONAL: f64 = 43.266_615_305_567_87;
 
-/// An image (PNG or JPEG) that is still to be read: a file, or the bytes of one.
+/// An image (PNG or JPEG) to be read: a file, or the bytes of one.
 #[derive(Debug, Clone)]
 pub struct ImageFile<'a> {
     path: &'a Path,
-    /// Its bytes, where they are in memory already.
+    /// Its bytes, if they are in memory already.
     bytes: Option<&'a [u8]>,
-    /// Size the image must have and what says so.
+    /// The required size of the image and the source of the requirement.
     expected: Option<((usize, usize), String)>,
     limit: u64,
 }
@@ -44,17 +44,17 @@ impl<'a> ImageFile<'a> {
         ImageFile { path, bytes: None, expected: None, limit: max_pixels() }
     }
 
-    /// A file that must be of this width and height; `size_from` is for the message: who says so.
+    /// A file that must have this width and height; `size_from` names the source of the requirement in messages.
     pub fn of_size(path: &'a Path, expected: (usize, usize), size_from: impl Into<String>) -> Self {
         ImageFile { expected: Some((expected, size_from.into())), ..ImageFile::new(path) }
     }
 
-    /// The bytes of a file, from within another one; `name` is for messages.
+    /// The bytes of a file, for example embedded in another one; `name` is for messages.
     pub fn of_bytes(name: &'a Path, bytes: &'a [u8]) -> Self {
         ImageFile { bytes: Some(bytes), ..ImageFile::new(name) }
     }
 
-    /// The same with a limit of its own, in pixels, in place of [`max_pixels`].
+    /// The same with its own limit in pixels instead of [`max_pixels`].
     pub fn with_limit(self, pixels: u64) -> Self {
         ImageFile { limit: pixels, ..self }
     }
@@ -79,7 +79,7 @@ impl<'a> ImageFile<'a> {
         }
     }
 
-    /// The decoder of these bytes once their header was read, if the size is as expected and within the limit; and the format.
+    /// The decoder of these bytes after reading the header, if the size is as expected and within the limit; and the format.
     fn decoder<'b>(
         &self,
         bytes: &'b [u8],
@@ -146,7 +146,7 @@ impl<'a> ImageFile<'a> {
         self.image(pixels.width(), pixels.height(), pixels.into_raw())
     }
 
-    /// Depth in metres, of one channel of 16 bits; zero where nothing was measured.
+    /// Depth in metres, from one channel of 16 bits; zero where nothing was measured.
     ///
     /// # Errors
     /// [`ImageFileError`] naming the file.
@@ -154,21 +154,21 @@ impl<'a> ImageFile<'a> {
         Ok(self.units()?.map(|&v| (f64::from(v) * metres_per_unit) as f32))
     }
 
-    /// A mask: every pixel that is not zero. Grey of 1, 2, 4, 8 or 16 bits, a palette, or RGB with one colour besides black; alpha
-    /// that is not full everywhere is the mask itself.
+    /// A mask: every pixel that is not zero. Grey of 1, 2, 4, 8 or 16 bits, a palette, or RGB with one colour besides black. An
+    /// alpha channel that is not opaque everywhere is the mask itself.
     ///
     /// # Errors
-    /// [`ImageFileError`] naming the file: also for a JPEG, whose zeros are not exact, for several colours, and where alpha and
-    /// colour say different things.
+    /// [`ImageFileError`] naming the file: also for a JPEG, whose zeros are not exact, for several colours, and if alpha and colour
+    /// contradict each other.
     pub fn mask(&self) -> Result<Mask, ImageFileError> {
         Ok(self.mask_and_hidden()?.0)
     }
 
-    /// A mask as [`ImageFile::mask`] reads it, and the part of it where nobody knows whether the object is there, because something
-    /// may hide it: the value 128 of grey images of 8 bits; `None` where there is none.
+    /// A mask as [`ImageFile::mask`] reads it, and the part of it where it is unknown whether the object is there, because
+    /// something may occlude it: the value 128 in grey images of 8 bits; `None` if there is no such pixel.
     ///
     /// # Errors
-    /// Those of [`ImageFile::mask`].
+    /// As [`ImageFile::mask`].
     pub fn mask_and_hidden(&self) -> Result<(Mask, Option<Mask>), ImageFileError> {
         let (image, format) = self.decode()?;
         if format == ImageFormat::Jpeg {
@@ -184,7 +184,7 @@ impl<'a> ImageFile<'a> {
         Ok((self.image(image.width(), image.height(), data)?, hidden))
     }
 
-    /// A colour image; grey becomes colour, alpha is dropped, and of 16 bits the upper eight are kept.
+    /// A colour image; grey is converted to colour, alpha is dropped, and of 16 bits the upper eight are kept.
     ///
     /// # Errors
     /// [`ImageFileError`] naming the file.
@@ -193,12 +193,12 @@ impl<'a> ImageFile<'a> {
         self.image(pixels.width(), pixels.height(), pixels.as_raw().as_chunks::<3>().0.to_vec())
     }
 
-    /// The focal length that the file names in its EXIF data (`FocalLengthIn35mmFilm`, related to the diagonal of 43.27 mm of that film:
-    /// CIPA DC-008), in pixels; `None` where it names none, or none that a camera can have. Of an image that was cut or enlarged
-    /// afterwards it is wrong.
+    /// The focal length in the file's EXIF data (`FocalLengthIn35mmFilm`, related to the diagonal of 43.27 mm of that film: CIPA
+    /// DC-008), in pixels; `None` if there is none, or none that a camera can have. It is wrong for an image that was cropped or
+    /// resized afterwards.
     ///
     /// # Errors
-    /// [`ImageFileError`] naming the file, for what is no image. Broken EXIF data are as none.
+    /// [`ImageFileError`] naming the file, for a file that is not an image. Invalid EXIF data count as none.
     pub fn focal_length(&self) -> Result<Option<f64>, ImageFileError> {
         let bytes = self.bytes()?;
         let mut decoder = self.decoder(&bytes)?.0;
@@ -207,7 +207,7 @@ impl<'a> ImageFile<'a> {
         let Ok(exif) = exif::Reader::new().read_raw(raw) else { return Ok(None) };
         let field = exif.get_field(exif::Tag::FocalLengthIn35mmFilm, exif::In::PRIMARY);
         let millimetres = field.and_then(|field| field.value.get_uint(0)).map(f64::from);
-        // From a fisheye to a telescope; 0 stands for "not known".
+        // From a fisheye to a telescope; 0 means "unknown".
         let possible = millimetres.filter(|f| (5.0..=2000.0).contains(f));
         Ok(possible.map(|f| f / FILM_DIAGONAL * f64::from(width).hypot(f64::from(height))))
     }
@@ -236,7 +236,7 @@ pub(crate) fn png_of_rgb(image: &RgbImage) -> Option<DynamicImage> {
     image::RgbImage::from_raw(image.width() as u32, image.height() as u32, data).map(DynamicImage::from)
 }
 
-/// 255 inside, 0 outside, and 128 where it is inside and hidden.
+/// A PNG with 255 inside, 0 outside, and 128 where the mask is inside and hidden.
 pub(crate) fn png_of_mask(mask: &Mask, hidden: Option<&Mask>) -> Option<DynamicImage> {
     let is_hidden = |i: usize| hidden.is_some_and(|h| h.as_slice().get(i).copied().unwrap_or(false));
     let value = |(i, m): (usize, &bool)| match m {
@@ -248,7 +248,7 @@ pub(crate) fn png_of_mask(mask: &Mask, hidden: Option<&Mask>) -> Option<DynamicI
     image::GrayImage::from_raw(mask.width() as u32, mask.height() as u32, data).map(DynamicImage::from)
 }
 
-/// Depth to 16 bit; what is missing or does not fit becomes 0, as a sensor would say "nothing measured".
+/// Depth as 16 bit; missing values and values that do not fit become 0, a sensor's value for "nothing measured".
 pub(crate) fn png_of_depth(depth: &DepthImage, metres_per_unit: f64) -> Option<DynamicImage> {
     let unit = |z: f32| {
         let value = (f64::from(z) / metres_per_unit).round();
@@ -259,7 +259,7 @@ pub(crate) fn png_of_depth(depth: &DepthImage, metres_per_unit: f64) -> Option<D
         .map(DynamicImage::from)
 }
 
-/// Whether a file is one of the family that phones write by default (ISO/IEC 23008-12).
+/// Whether a file is HEIF, which phones write by default (ISO/IEC 23008-12).
 fn is_heif(bytes: &[u8]) -> bool {
     let brand = bytes.get(8..12).filter(|_| bytes.get(4..8) == Some(b"ftyp".as_slice()));
     brand.is_some_and(|brand| {
@@ -323,10 +323,10 @@ mod tests {
         // 26 mm on film of 43.27 mm are .601 of the image's diagonal of 50 pixels.
         let f = of(&jpeg_with_exif(26)).unwrap();
         assert!((f - 50.0 * 26.0 / 43.2666).abs() < 1e-3, "{f}");
-        // Not known, or none that a camera has.
+        // Unknown, or outside the range of cameras.
         assert_eq!([0, 4, 2001].map(|f| of(&jpeg_with_exif(f))), [None; 3]);
         assert_eq!(of(&depth_png()), None);
-        // Data that end early are as none.
+        // Truncated data count as none.
         let whole = jpeg_with_exif(26);
         let mut broken = whole.clone();
         broken[40..50].fill(0xff);
@@ -395,7 +395,7 @@ mod tests {
             assert!(message.contains("at most 100.0") && message.contains("--max-pixels"), "{message}");
         }
         assert_eq!(ImageFile::new(&path).with_limit(120_000_000).size().unwrap(), (20_000, 6_000));
-        // A file that never ends.
+        // An endless file.
         #[cfg(target_os = "linux")]
         {
             let endless = ImageFile::new(Path::new("/dev/zero")).with_limit(1000);
@@ -403,7 +403,7 @@ mod tests {
         }
     }
 
-    /// What is inflated beside the pixels: a colour profile of 40 MB in 40 kB is left out.
+    /// Decompressed data other than pixels: a colour profile of 40 MB in 40 kB is left out.
     #[test]
     fn a_colour_profile_that_inflates_is_left_out() {
         let mut info = png::Info::with_size(8, 8);
@@ -441,7 +441,7 @@ mod tests {
         assert_eq!(file(&path).mask_and_hidden().unwrap().1, None);
     }
 
-    /// A 16-bit mask lost its values below 129, a coloured one what was dark.
+    /// A 16-bit mask once lost its values below 129, a coloured one its dark pixels.
     #[test]
     fn every_pixel_that_is_not_zero_is_in_the_mask() {
         let line = [false, true, true, true];
@@ -506,7 +506,7 @@ mod tests {
         }
     }
 
-    /// One object in a large image takes next to no bytes: it was taken for a file that was cut off.
+    /// One object in a large image takes very few bytes: the file was once taken for a truncated one.
     #[test]
     fn masks_of_single_bits_that_compress_well() {
         let dir = tempfile::tempdir().unwrap();

@@ -1,4 +1,4 @@
-//! Single image files, outside any dataset: read into checked types, written atomically.
+//! Single image files outside datasets: read into checked types, written atomically.
 
 use std::path::Path;
 
@@ -47,7 +47,7 @@ pub fn write_rgb(path: &Path, image: &RgbImage) -> Result<(), ImageFileError> {
     write(path, png_of_rgb(image))
 }
 
-/// Writes depth in metres as a 16-bit PNG; what does not fit is stored as missing.
+/// Writes depth in metres as a 16-bit PNG; values that do not fit are stored as missing.
 ///
 /// # Errors
 /// [`ImageFileError`] naming the file.
@@ -63,7 +63,8 @@ pub fn write_mask(path: &Path, mask: &Mask) -> Result<(), ImageFileError> {
     write(path, png_of_mask(mask, None))
 }
 
-/// Reads a mask with the part of it where nobody knows whether the object is there: [`ImageFile::mask_and_hidden`].
+/// Reads a mask with the part of it where it is unknown whether the object is there:
+/// [`ImageFile::mask_and_hidden`].
 ///
 /// # Errors
 /// [`ImageFileError`] naming the file.
@@ -71,7 +72,7 @@ pub fn read_mask_and_hidden(path: &Path) -> Result<(Mask, Option<Mask>), ImageFi
     ImageFile::new(path).mask_and_hidden()
 }
 
-/// Writes a mask as PNG: 255 inside, 0 outside, 128 where it is inside and hidden.
+/// Writes a mask as PNG: 255 inside, 0 outside, 128 where the mask is inside and hidden.
 ///
 /// # Errors
 /// [`ImageFileError`] naming the file.

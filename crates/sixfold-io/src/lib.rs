@@ -1,6 +1,7 @@
-//! Files outside any dataset: colour, depth and mask images, camera files, writes that are seen whole or not at all.
+//! Files outside datasets: colour, depth and mask images, camera files, and atomic writes.
 //!
-//! Images are decoded without trusting their headers; depth comes out in metres. What knows datasets stands above.
+//! Images are decoded without trusting their headers; depth is returned in metres. Crates above this one handle
+//! datasets.
 
 #![warn(unreachable_pub, unnameable_types)]
 

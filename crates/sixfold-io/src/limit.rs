@@ -1,27 +1,27 @@
-//! How large an image may be: the limit that every reader of images asks before it decodes anything.
+//! The limit on image sizes, which every reader of images checks before it decodes anything.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// Most pixels of an image where nothing else is set: 100 megapixels, more than depth and industrial cameras have.
+/// Default limit of pixels per image: 100 megapixels, more than depth and industrial cameras have.
 pub const DEFAULT_MAX_PIXELS: u64 = 100_000_000;
 
 static MAX_PIXELS: AtomicU64 = AtomicU64::new(DEFAULT_MAX_PIXELS);
 
-/// Sets the limit of this process for images that have none of their own ([`crate::ImageFile::with_limit`]) and for the sizes that
-/// camera files state: what a program's option says. At least 1.
+/// Sets the limit of this process for images without their own limit ([`crate::ImageFile::with_limit`]) and for the sizes that
+/// camera files state, as for a program's option. At least 1.
 pub fn set_max_pixels(pixels: u64) {
     MAX_PIXELS.store(pixels.max(1), Ordering::Relaxed);
 }
 
-/// The limit that is set.
+/// The current limit.
 pub fn max_pixels() -> u64 {
     MAX_PIXELS.load(Ordering::Relaxed)
 }
 
-/// Tests a size that a header or a camera file states.
+/// Checks a size that a header or a camera file states.
 ///
 /// # Errors
-/// What is too large, and how the limit is raised.
+/// The size that is too large, and how to raise the limit.
 pub fn check_pixels(width: usize, height: usize, limit: u64) -> Result<(), String> {
     let pixels = (width as u64).saturating_mul(height as u64);
     if pixels <= limit {

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use thiserror::Error;
 
-/// Why something is not locked.
+/// Why a lock cannot be taken.
 #[derive(Debug, Error)]
 pub enum LockError {
     /// Another process writes there.
@@ -15,9 +15,9 @@ pub enum LockError {
         path.display(), holder.map(|id| format!(" ({id})")).unwrap_or_default()
     )]
     Taken {
-        /// What was to be locked.
+        /// The path to be locked.
         path: PathBuf,
-        /// The other process, where it could be read.
+        /// The other process, if its id could be read.
         holder: Option<u32>,
     },
     /// The system could not make or lock the lock file.
@@ -25,27 +25,28 @@ pub enum LockError {
     Io {
         /// The lock file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: io::Error,
     },
 }
 
-/// A lock that is held until it is dropped. It is a file beside what it locks, `.NAME.lock`, which goes away with the lock; one
-/// that a killed process left locks nothing.
+/// A lock that is held until it is dropped. It is a file `.NAME.lock` beside the locked path, which is removed with the lock;
+/// the file of a killed process locks nothing.
 #[derive(Debug)]
 pub struct WriteLock {
     path: PathBuf,
-    /// Folders that were made for the lock file, the deepest first: they go with it unless something is in them.
+    /// Folders that were created for the lock file, the deepest first: they are removed with it unless they contain other
+    /// files.
     made: Vec<PathBuf>,
-    /// Holds the system's lock, which ends with the process in any case.
+    /// Holds the system's lock, which the system releases when the process ends.
     _file: File,
 }
 
 impl WriteLock {
-    /// Locks `path`, a file or a folder that need not exist yet. Folders on the way are made.
+    /// Locks `path`, a file or a folder that need not exist yet. Missing parent folders are created.
     ///
     /// # Errors
-    /// [`LockError::Taken`] at once when another process, or another lock of this one, holds it.
+    /// [`LockError::Taken`] immediately when another process, or another lock of this one, holds it.
     pub fn take(path: &Path) -> Result<WriteLock, LockError> {
         let lock = lock_file(path).map_err(|source| LockError::Io { path: path.into(), source })?;
         let io = |source| LockError::Io { path: lock.clone(), source };
@@ -59,7 +60,7 @@ impl WriteLock {
             }
             let opened = File::options().read(true).write(true).create(true).truncate(false).open(&lock);
             let mut file = match opened {
-                // Another lock that made the folder took it away again.
+                // Another lock had created the folder and has removed it again.
                 Err(error) if error.kind() == io::ErrorKind::NotFound => continue,
                 opened => opened.map_err(io)?,
             };
@@ -72,11 +73,11 @@ impl WriteLock {
                 }
                 Err(TryLockError::Error(source)) => return Err(io(source)),
             }
-            // Whoever held it may have removed it between opening and locking: then this is a lock on nothing.
+            // The previous holder may have removed the file between opening and locking: then this lock has no effect.
             if !still_there(&file, &lock) {
                 continue;
             }
-            // Only to name this process to others: where the disk is full, the lock holds all the same.
+            // The id only tells other processes who holds the lock: on a full disk the lock holds nevertheless.
             let id = format!("{}\n", std::process::id());
             let _ = file.set_len(0).and_then(|()| file.rewind()).and_then(|()| file.write_all(id.as_bytes()));
             return Ok(WriteLock { path: lock, made, _file: file });
@@ -86,7 +87,7 @@ impl WriteLock {
 
 impl Drop for WriteLock {
     fn drop(&mut self) {
-        // Removed while it is still locked; where the system does not allow that, an empty lock file stays.
+        // The file is removed while still locked; if the system does not allow that, an empty lock file remains.
         let _ = std::fs::remove_file(&self.path);
         for folder in &self.made {
             let _ = std::fs::remove_dir(folder);
@@ -97,14 +98,14 @@ impl Drop for WriteLock {
 fn lock_file(path: &Path) -> io::Result<PathBuf> {
     let name = match path.file_name() {
         Some(name) => name.to_os_string(),
-        // `.` and `..` have no name of their own.
+        // `.` and `..` are not names.
         None => path.canonicalize()?.file_name().map(ToOwned::to_owned).unwrap_or_default(),
     };
     let place = if path.file_name().is_some() { path.to_path_buf() } else { path.canonicalize()? };
     Ok(place.with_file_name(format!(".{}.lock", name.to_string_lossy())))
 }
 
-/// Whether `path` still names this open file.
+/// Whether `path` still refers to this open file.
 #[cfg(unix)]
 pub(crate) fn still_there(file: &File, path: &Path) -> bool {
     use std::os::unix::fs::MetadataExt;
@@ -114,7 +115,7 @@ pub(crate) fn still_there(file: &File, path: &Path) -> bool {
     }
 }
 
-/// Whether `path` still names a file; that it is this one cannot be told here.
+/// Whether `path` still refers to a file; whether it is this one cannot be checked here.
 #[cfg(not(unix))]
 pub(crate) fn still_there(_: &File, path: &Path) -> bool {
     path.exists()

@@ -1,14 +1,14 @@
-//! Which pixels of an image file are a mask: those that are not zero. What could mean two things is refused.
+//! The pixels of an image file that belong to a mask: those that are not zero. Ambiguous files are refused.
 //!
-//! Alpha that is full everywhere says nothing. Otherwise it is the mask, as in an object that was cut out, unless the colours say
-//! something else: then nobody knows which of both was meant.
+//! An alpha channel that is opaque everywhere is ignored. Otherwise it is the mask, as for a cut-out object, unless the colours
+//! contradict it: then it is unclear which of both was meant.
 
 use image::DynamicImage;
 
-/// One flag a pixel, row by row.
+/// One flag per pixel, row by row.
 ///
 /// # Errors
-/// What is ambiguous, what was expected and what to do.
+/// A message with the ambiguity, the expectation and advice.
 pub(crate) fn inside(image: &DynamicImage) -> Result<Vec<bool>, String> {
     match image {
         DynamicImage::ImageLuma8(p) => Ok(p.as_raw().iter().map(|&v| v > 0).collect()),
@@ -26,22 +26,22 @@ pub(crate) fn inside(image: &DynamicImage) -> Result<Vec<bool>, String> {
     }
 }
 
-/// The grey value of pixels of which nobody knows whether they show the object.
+/// The grey value of pixels that may or may not show the object.
 pub(crate) const HIDDEN: u8 = 128;
 
-/// Which pixels of a grey image of 8 bits are [`HIDDEN`]; `None` where none is.
+/// The [`HIDDEN`] pixels of a grey image of 8 bits; `None` if there are none.
 pub(crate) fn hidden(image: &DynamicImage) -> Option<Vec<bool>> {
     let DynamicImage::ImageLuma8(pixels) = image else { return None };
     let hidden: Vec<bool> = pixels.as_raw().iter().map(|v| *v == HIDDEN).collect();
     hidden.contains(&true).then_some(hidden)
 }
 
-/// What the pixels' values are made of.
+/// The type of pixel values.
 trait Value: Copy + Default + PartialEq {}
 impl Value for u8 {}
 impl Value for u16 {}
 
-/// Grey, or one colour besides black: several would be several objects, or a photograph.
+/// Grey, or one colour besides black: several colours would be several objects, or a photograph.
 fn colored<T: Value>(pixels: impl Iterator<Item = [T; 3]> + Clone) -> Result<Vec<bool>, String> {
     let black = [T::default(); 3];
     if pixels.clone().any(|[r, g, b]| r != g || g != b) {

@@ -1,15 +1,15 @@
-//! Opening files that somebody else names: regular files alone, up to a size. A pipe would be waited for for ever, a device such
-//! as `/dev/zero` read until memory ends.
+//! Opening files whose paths come from outside: only regular files, up to a size. Otherwise reading a pipe could wait for ever,
+//! and a device such as `/dev/zero` would be read until memory is exhausted.
 
 use std::fs::{File, FileType, Metadata};
 use std::io::{self, Read};
 use std::path::Path;
 
-/// Limits of [`read_regular`] by what a file holds, in bytes: several times as much as any such file needs.
+/// Limits of [`read_regular`] by kind of file, in bytes: several times as much as any such file needs.
 pub mod limits {
     /// A mesh, or a buffer of one.
     pub const MESH: u64 = 2 << 30;
-    /// An image file, a texture among them: compressed.
+    /// A compressed image file, including textures.
     pub const IMAGE: u64 = 1 << 30;
     /// A camera, a gripper, a list of names, one object's record.
     pub const SMALL_TEXT: u64 = 64 << 20;
@@ -17,20 +17,20 @@ pub mod limits {
     pub const LARGE_TEXT: u64 = 2 << 30;
     /// A network's weights.
     pub const WEIGHTS: u64 = 8 << 30;
-    /// What is derived from one object: a description, templates, descriptors.
+    /// Derived data of one object: a description, templates, descriptors.
     pub const DERIVED: u64 = 1 << 30;
 }
 
 /// Opens a regular file of at most `limit` bytes to read it.
 ///
 /// # Errors
-/// What the system says; [`io::ErrorKind::InvalidInput`] for a folder, a pipe or a device, [`io::ErrorKind::FileTooLarge`] for a
-/// larger file. The messages name what was found and expected, not the file.
+/// The system's error; [`io::ErrorKind::InvalidInput`] for a folder, a pipe or a device, [`io::ErrorKind::FileTooLarge`] for a
+/// larger file. The messages state what was found and expected, but not the file.
 pub fn open_regular(path: &Path, limit: u64) -> io::Result<File> {
-    // Asked before it is opened: opening a pipe waits for whoever writes into it.
+    // Check before opening, because opening a pipe waits for a writer.
     check(&std::fs::metadata(path)?, limit)?;
     let file = File::open(path)?;
-    // It may be another one by now.
+    // It may have been replaced meanwhile.
     check(&file.metadata()?, limit)?;
     Ok(file)
 }
@@ -43,7 +43,7 @@ pub fn read_regular(path: &Path, limit: u64) -> io::Result<Vec<u8>> {
     let file = open_regular(path, limit)?;
     let size = file.metadata()?.len();
     let mut bytes = Vec::with_capacity(usize::try_from(size).unwrap_or_default());
-    // A file that grows meanwhile, or one of those without a size, ends at the limit as well.
+    // Reading stops at the limit also for a file that grows meanwhile or that reports no size.
     file.take(limit.saturating_add(1)).read_to_end(&mut bytes)?;
     if bytes.len() as u64 > limit { Err(too_large(bytes.len() as u64, limit)) } else { Ok(bytes) }
 }
@@ -51,7 +51,7 @@ pub fn read_regular(path: &Path, limit: u64) -> io::Result<Vec<u8>> {
 /// The text of a regular file of at most `limit` bytes, in UTF-8.
 ///
 /// # Errors
-/// As [`open_regular`], and [`io::ErrorKind::InvalidData`] for bytes that are no UTF-8.
+/// As [`open_regular`], and [`io::ErrorKind::InvalidData`] for bytes that are not UTF-8.
 pub fn read_regular_text(path: &Path, limit: u64) -> io::Result<String> {
     String::from_utf8(read_regular(path, limit)?).map_err(|_| {
         io::Error::new(io::ErrorKind::InvalidData, "found bytes that are no UTF-8, expected text")

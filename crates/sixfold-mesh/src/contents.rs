@@ -1,5 +1,5 @@
-//! What meshes hold, as hashes: the same for the same numbers wherever they were read, another as soon as one of them changes. For
-//! keys of what is derived and for comparing inputs of an earlier run, see [`sixfold_io::Fnv1a`].
+//! Hashes of the contents of meshes: equal for equal numbers, whichever file they come from, and different as soon as one number
+//! changes. Used as keys of derived data and to compare inputs with those of an earlier run, see [`sixfold_io::Fnv1a`].
 
 use sixfold_geometry::Vec3;
 use sixfold_io::Fnv1a;
@@ -18,7 +18,7 @@ impl Mesh {
     pub fn contents_hash(&self) -> u64 {
         let mut hash = Fnv1a::default();
         self.write_shape(&mut hash);
-        // The kind and the count before each part keep one that is missing apart from one that is another.
+        // The kind and the count before each part distinguish a missing part from a different one.
         if let Some(normals) = self.normals() {
             begin(&mut hash, 1, normals.len());
             normals.iter().for_each(|normal| write_point(&mut hash, normal));

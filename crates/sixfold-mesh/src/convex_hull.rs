@@ -1,9 +1,9 @@
 //! The convex hull of a mesh's vertices by quickhull (Barber, Dobkin and Huhdanpaa 1996).
 //!
-//! The vertices are moved to the nearest points of a grid that is far finer than the tolerance. On it, which side of a
-//! face a point lies on is decided in whole numbers, without error, so that what the proofs of the paper need holds in
-//! the program too: the faces that a point sees are one connected patch and its horizon is one closed loop, however
-//! small and flat the faces are. With rounding errors instead, smooth dense shapes come out torn and folded.
+//! The vertices are moved to the nearest points of a grid that is far finer than the tolerance. On the grid, the side of a face on
+//! which a point lies is decided in integers, without error. The assumptions of the paper's proofs therefore hold in the program
+//! too: the faces visible from a point are one connected patch and its horizon is one closed loop, however small and flat the faces
+//! are. With rounding errors, hulls of smooth dense shapes would have holes and folds.
 
 use std::collections::HashSet;
 
@@ -11,8 +11,8 @@ use sixfold_geometry::{Vec3, sphere_directions};
 
 use crate::mesh::{Mesh, MeshError};
 
-/// Points nearer to a face than this fraction of the extent lie on it. Much larger, and points left out beside thin shapes would be
-/// further than that outside of later, narrow faces.
+/// Points nearer to a face than this fraction of the extent count as on it. With a much larger value, points left out beside thin
+/// shapes would be further than that outside of later, narrow faces.
 const TOLERANCE: f64 = 1e-9;
 
 /// Steps of the grid over the extent: a volume of three edges, 6 * 2^(3 * 40), is less than 2^127.
@@ -21,18 +21,19 @@ const STEPS: f64 = (1u64 << 40) as f64;
 /// [`TOLERANCE`] in steps. It has to be well above the rounding errors of [`Face::height`], a few thousandths of a step.
 const FLAT: f64 = TOLERANCE * STEPS;
 
-/// The hull is computed again at most so many times to get rid of corners in the middle of edges; once is nearly always enough.
+/// Maximum number of times that the hull is computed again to remove corners in the interior of edges; once is nearly always
+/// enough.
 const REPETITIONS: usize = 8;
 
-/// So many directions' furthest points go first. They hold the corners of boxes and the like, so that few points in the
-/// middle of a flat side ever become corners, and most points inside are dropped at once.
+/// Number of directions whose furthest points are added first. These include the corners of boxes and similar shapes, so that few
+/// points inside a flat side ever become corners, and most interior points are dropped at once.
 const DIRECTIONS: usize = 64;
 
 impl Mesh {
     /// The smallest convex body around the vertices, by quickhull (Barber, Dobkin and Huhdanpaa 1996), without colours.
-    /// Its vertices are some of the mesh's, in metres; its faces are triangles that look outwards, each edge belongs to
-    /// two of them. Vertices less than a billionth of the extent (the longest side of the bounding box) outside of a face
-    /// count as on it. The faces of the mesh do not matter.
+    /// Its vertices are some of the mesh's, in metres; its faces are triangles that face outwards, and each edge belongs to two of
+    /// them. Vertices less than a billionth of the extent (the longest side of the bounding box) outside of a face count as on it.
+    /// The faces of the mesh are ignored.
     ///
     /// # Errors
     /// [`MeshError`] for a mesh whose vertices lie in a plane, on a line or in a point: its hull has no faces.
@@ -86,9 +87,9 @@ impl Point {
     }
 }
 
-/// The vertices on the grid; all in one point for a mesh without extent.
+/// The vertices on the grid; all at one point for a mesh without extent.
 fn on_grid(mesh: &Mesh) -> Vec<Point> {
-    // Halves, so that the extent of coordinates near the largest number is finite.
+    // Halved, so that the extent stays finite for coordinates near the largest number.
     let (low, high) = mesh.bounding_box();
     let (low, high) = (low * 0.5, high * 0.5);
     let extent = (high - low).amax();
@@ -96,7 +97,7 @@ fn on_grid(mesh: &Mesh) -> Vec<Point> {
     mesh.vertices().iter().map(|v| Point((v * 0.5 - low).map(step).into())).collect()
 }
 
-/// The point of the largest value, the first of several, and the value.
+/// The point with the largest value (the first of equal ones), and the value.
 fn furthest(points: &[Point], among: &[u32], value: impl Fn(Point) -> f64) -> Option<(u32, f64)> {
     among
         .iter()
@@ -104,8 +105,8 @@ fn furthest(points: &[Point], among: &[u32], value: impl Fn(Point) -> f64) -> Op
         .reduce(|best, new| if new.1 > best.1 { new } else { best })
 }
 
-/// Four points far from each other, so ordered that the fourth lies behind the face of the first three; `None` where all lie
-/// in a plane.
+/// Four points far from each other, ordered so that the fourth lies behind the face of the first three; `None` if all points lie in
+/// a plane.
 fn tetrahedron(points: &[Point], among: &[u32]) -> Option<[u32; 4]> {
     let best =
         |value: &dyn Fn(Point) -> f64| furthest(points, among, value).filter(|b| b.1 > FLAT).map(|b| b.0);
@@ -131,7 +132,7 @@ struct Face {
     /// Outwards, of length `length`: the cross product of two edges, each number rounded once.
     normal: Vec3,
     length: f64,
-    /// Points further than the tolerance outside of this face that no earlier face has.
+    /// Points outside of this face by more than the tolerance that are not in the list of an earlier face.
     outside: Vec<u32>,
     /// Whether it still belongs to the hull.
     alive: bool,
@@ -168,7 +169,7 @@ impl Face {
     fn is_seen_by(&self, points: &[Point], point: Point) -> bool {
         let d = point.offset_from(self.at);
         let height = self.normal.dot(&d);
-        // Four roundings on the way of each product, each of 2^-53 at most.
+        // Each product has four roundings, each of 2^-53 at most.
         let error = 1e-15 * self.normal.abs().dot(&d.abs());
         if height.abs() > error {
             return height > 0.0;
@@ -187,14 +188,14 @@ fn exact_normal(points: &[Point], corners: [u32; 3]) -> [i128; 3] {
 /// A closed convex surface that grows point by point.
 struct Hull<'a> {
     points: &'a [Point],
-    /// Those of before too, no longer alive: a face keeps its number.
+    /// All faces, including removed ones, which are no longer alive: a face keeps its number.
     faces: Vec<Face>,
-    /// For every point of the horizon, which of its edges begins there; of the points' length.
+    /// For every point of the horizon, the horizon edge that begins there; as long as `points`.
     begins: Vec<u32>,
 }
 
 impl<'a> Hull<'a> {
-    /// The hull of `all`; those of `first` go first. `None` where all lie in a plane.
+    /// The hull of `all`; the points of `first` are added first. `None` if all points lie in a plane.
     fn of(points: &'a [Point], first: &[u32], all: &[u32]) -> Option<Hull<'a>> {
         let corners = tetrahedron(points, first).or_else(|| tetrahedron(points, all))?;
         let mut hull = Hull::new(points, corners);
@@ -203,12 +204,12 @@ impl<'a> Hull<'a> {
         Some(hull)
     }
 
-    /// The corners without those that lie on an edge between two others, up to the tolerance; `None` where there are no such.
+    /// The corners without those that lie on an edge between two others, up to the tolerance; `None` if there are no such corners.
     ///
-    /// Of points on one line of a side, which the grid moves off it by half a step, the middle one may come first: it is as far
-    /// outside as the others. Then one of the two faces beside the line sees the next point and the other does not, and between
-    /// them comes a face of three points on a line: a proper one on the grid, but its normal says nothing of the mesh. Where the
-    /// ends of the line come first, no face is far from the middle one.
+    /// The grid moves points on a line in a side by up to half a step, so a point in the middle of the line may be added first: it
+    /// is as far outside as the others. The next point is then visible from only one of the two faces beside the line, and a face
+    /// of three collinear points is inserted between them. On the grid this face is valid, but its normal is meaningless for the
+    /// mesh. If the ends of the line are added first, the middle point is not far from any face.
     fn corners_without_those_on_edges(&self) -> Option<Vec<u32>> {
         let alive = || self.faces.iter().filter(|f| f.alive);
         let on_edges: HashSet<u32> = alive().filter_map(|f| f.corner_on_edge(self.points)).collect();
@@ -230,7 +231,7 @@ impl<'a> Hull<'a> {
         Hull { points, faces, begins: vec![0; points.len()] }
     }
 
-    /// Grows until none of the points lies outside.
+    /// Adds points until none lies outside.
     fn add(&mut self, among: &[u32]) {
         for &i in among {
             let point = self.points[i as usize];
@@ -249,7 +250,7 @@ impl<'a> Hull<'a> {
         }
     }
 
-    /// Replaces the faces that a point sees, of which `first` is one, by a cone from their border to the point.
+    /// Replaces the faces that are visible from a point, of which `first` is one, by a cone from their border to the point.
     fn insert(&mut self, apex: u32, first: u32) {
         let point = self.points[apex as usize];
         self.faces[first as usize].alive = false;
@@ -310,8 +311,8 @@ mod tests {
         mesh.faces().iter().map(|f| corner(f, 0).dot(&corner(f, 1).cross(&corner(f, 2))) / 6.0).sum()
     }
 
-    /// The hull of points, after a check of all that makes it their hull: a closed surface without holes, its vertices some
-    /// of the points, and no point further outside of a face than twice the tolerance; so it is convex at every edge too.
+    /// The hull of points, after checking that it is one: a closed surface whose vertices are some of the points, with no point
+    /// further outside of a face than twice the tolerance, which makes it convex at every edge too.
     fn hull_of(points: &[Vec3]) -> Mesh {
         let mesh = Mesh::new(points.to_vec(), vec![]).unwrap();
         let hull = mesh.convex_hull().unwrap();
@@ -427,7 +428,7 @@ mod tests {
                 assert!(hull.vertices().len() < 20, "{}", hull.vertices().len());
             }
         }
-        // A lens, flat but round: hardly any direction has its middle as the furthest point.
+        // A lens, flat but round: its centre is the furthest point in hardly any direction.
         let mut lens = sphere_directions(2000);
         lens.iter_mut().for_each(|p| p.z *= 1e-5);
         assert!(hull_of(&lens).vertices().len() > 1500);

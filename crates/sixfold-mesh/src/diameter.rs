@@ -1,8 +1,8 @@
 //! The exact diameter of a point set by branch and bound over a tree of boxes.
 //!
-//! A double sweep gives a lower bound; two boxes whose farthest corners are no farther apart than the best
-//! pair found cannot hold a better one, nor can two balls (the tighter bound on round objects). No convex hull, so flat, doubled or degenerate point sets need no
-//! special care.
+//! A double sweep gives a lower bound. Two boxes whose farthest corners are no farther apart than the best pair found cannot hold a
+//! better pair, and neither can two balls (the tighter bound on round objects). No convex hull is computed, so flat, duplicated or
+//! degenerate point sets are no special cases.
 
 use std::cmp::Ordering;
 
@@ -11,12 +11,12 @@ use sixfold_geometry::Vec3;
 use crate::Mesh;
 
 const LEAF: usize = 8;
-/// Keeps a bound above the truth whatever is lost to rounding.
+/// Keeps a bound above the true value in spite of rounding.
 const ROUND_UP: f64 = 1.0 + 1e-12;
-/// So many pairs of boxes are compared for the exact diameter; then pairs that are longer by less than [`CLOSE`] are let go. Only
-/// shapes made for it come that far: all points of one part nearly as far from all points of another.
+/// Number of pairs of boxes that are compared for the exact diameter; after that, pairs that are longer by less than [`CLOSE`] are
+/// skipped. Only contrived shapes reach it: all points of one part nearly equally far from all points of another.
 const WORK: u32 = 30_000_000;
-/// Of squared distances.
+/// Ratio of squared distances.
 const CLOSE: f64 = 1.0 + 1e-6;
 
 impl Mesh {
@@ -29,7 +29,7 @@ impl Mesh {
 /// The largest distance between two points; zero for fewer than two.
 pub(crate) fn diameter(points: &[Vec3]) -> f64 {
     let Some(first) = points.first() else { return 0.0 };
-    // A lower bound by walking to the farthest point a few times.
+    // A lower bound: move to the farthest point a few times.
     let mut best = 0.0;
     let mut from = *first;
     for _ in 0..8 {
@@ -45,7 +45,7 @@ pub(crate) fn diameter(points: &[Vec3]) -> f64 {
     if kept.is_empty() {
         return best.sqrt();
     }
-    // Thousands of points at each of two places would make all their pairs.
+    // Remove duplicates: thousands of points at each of two places would give all their pairs.
     let order = |a: &Vec3, b: &Vec3| (0..3).fold(Ordering::Equal, |o, k| o.then(a[k].total_cmp(&b[k])));
     kept.sort_unstable_by(order);
     kept.dedup();
@@ -92,7 +92,7 @@ struct Node {
     bounds: Bounds,
     /// The centre of the box.
     middle: Vec3,
-    /// The distance of the farthest point from the middle, rounded up.
+    /// The distance of the farthest point from the centre, rounded up.
     radius: f64,
     start: usize,
     end: usize,
@@ -150,7 +150,7 @@ fn search(nodes: &[Node], points: &[Vec3], a: usize, b: usize, best: &mut f64, w
             let [b0, b1] = children(b);
             let mut pairs =
                 [(a0, b0), (a0, b1), (a1, b0), (a1, b1)].map(|(i, j)| (nodes[i].bound(&nodes[j]), i, j));
-            // Children of one node, and a leaf in the place of two children, make a pair twice.
+            // Two children of the same node, and a leaf in place of two children, give the same pair twice.
             if a == b {
                 pairs[2].0 = f64::NEG_INFINITY;
             }

@@ -1,4 +1,4 @@
-//! What can be wrong with a mesh file: each error names the file, the place in it, and what to do.
+//! Errors of mesh files: each names the file, the place in it, and what to do.
 
 use thiserror::Error;
 
@@ -13,7 +13,7 @@ pub enum MeshFileError {
     Io {
         /// The file.
         file: String,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
     /// A file that the mesh file names cannot be read.
@@ -28,26 +28,26 @@ pub enum MeshFileError {
         /// Why it cannot be used.
         reason: String,
     },
-    /// The file's name has no ending that is known.
+    /// The file name has an unknown extension.
     #[error(
         "{file}: unknown mesh format \"{found}\", expected a file ending in .ply, .obj, .stl, .gltf, .glb or .xyz"
     )]
     Format {
         /// The file.
         file: String,
-        /// The ending.
+        /// The extension.
         found: String,
     },
-    /// A field holds something else than it should.
+    /// A field holds an invalid value.
     #[error("{file}: {field}: expected {expected}, found {found}")]
     Field {
         /// The file.
         file: String,
         /// Element and property, or line, or object.
         field: String,
-        /// What should be there.
+        /// The expected value.
         expected: String,
-        /// What is there.
+        /// The value found.
         found: String,
     },
     /// A `models_info.json` does not describe the mesh of an object.
@@ -62,9 +62,9 @@ pub enum MeshFileError {
         object: u32,
         /// The field.
         field: String,
-        /// What is there.
+        /// The value found.
         found: String,
-        /// What the mesh says.
+        /// The value computed from the mesh.
         expected: String,
     },
     /// The arrays of the file do not form a mesh.
@@ -75,7 +75,7 @@ pub enum MeshFileError {
         /// What is wrong.
         source: MeshError,
     },
-    /// The object is no tabletop object: most often the unit is wrong.
+    /// The object does not have the size of a tabletop object: usually the unit is wrong.
     #[error("{file}: {explanation}")]
     Size {
         /// The file.

@@ -1,4 +1,4 @@
-//! The door for mesh files: format by ending, unit to metres, and the check for a wrong unit.
+//! Entry point for mesh files: format by extension, conversion to metres, and the check for a wrong unit.
 
 use std::cell::Cell;
 use std::io::{self, Write as _};
@@ -11,27 +11,27 @@ use sixfold_io::{ImageFile, ImageFileError, limits, read_regular, write_atomical
 use crate::ply::shown_name;
 use crate::{Mesh, MeshFileError, Unit};
 
-/// Smallest diameter that [`read_mesh`] takes without asking, in metres.
+/// Smallest diameter that [`read_mesh`] accepts, in metres.
 pub const SMALLEST_DIAMETER: f64 = 0.005;
-/// Largest diameter that [`read_mesh`] takes without asking, in metres.
+/// Largest diameter that [`read_mesh`] accepts, in metres.
 pub const LARGEST_DIAMETER: f64 = 5.0;
 
-/// Furthest from the origin of its frame that [`read_mesh`] takes an object without asking, in metres: single precision still
-/// tells a tenth of a millimetre there.
+/// Largest distance of an object from the origin of its frame that [`read_mesh`] accepts, in metres: single precision still
+/// resolves a tenth of a millimetre there.
 pub const LARGEST_OFFSET: f64 = 1000.0;
-/// Largest area that [`read_mesh`] takes without asking, in squares of the diameter. Objects with all their inner walls have tens;
-/// faces that cover each other in thousands take minutes to render and are no object.
+/// Largest area that [`read_mesh`] accepts, in squares of the diameter. Objects with all their inner walls reach tens. Thousands
+/// of faces on top of each other take minutes to render and are not an object.
 pub const LARGEST_AREA: f64 = 1000.0;
-/// Most bytes of all files together that a mesh file names.
+/// Limit on the bytes of all files together that a mesh file refers to.
 const MOST_NAMED: u64 = 4 << 30;
 
-/// How [`read_mesh_with`] reads mesh files.
+/// Options of [`read_mesh_with`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct MeshOptions {
-    /// Read textures, materials and buffers wherever the mesh file says, not only at or below its own folder: a mesh from
-    /// elsewhere could name any file of this machine.
+    /// Read textures, materials and buffers from any path in the mesh file, not only from its own folder and below. A mesh from an
+    /// untrusted source could refer to any file of this machine.
     pub allow_outside: bool,
-    /// Test the size: [`check_size`].
+    /// Whether the size is checked, see [`check_size`].
     pub check_size: bool,
 }
 
@@ -44,17 +44,17 @@ impl Default for MeshOptions {
 }
 
 impl MeshOptions {
-    /// Makes [`MeshOptions::allow_outside`] the default in this process, for meshes of datasets and stores as well: for programs
-    /// whose user asks for it.
+    /// Makes [`MeshOptions::allow_outside`] the default in this process, also for meshes of datasets and stores. For programs
+    /// whose user requests it.
     pub fn allow_outside_everywhere() {
         ALLOW_OUTSIDE.store(true, Ordering::Relaxed);
     }
 }
 
-/// Gives the bytes of a file that a mesh file names (texture, material, buffer), by that name.
+/// Returns the bytes of a file that a mesh file refers to (texture, material, buffer), by its name there.
 pub type Resources<'a> = &'a dyn Fn(&str) -> io::Result<Vec<u8>>;
 
-/// The [`Resources`] of bytes that stand alone: every name is missing.
+/// The [`Resources`] for mesh data without other files: every name is missing.
 ///
 /// # Errors
 /// Always [`io::ErrorKind::NotFound`].
@@ -70,7 +70,7 @@ pub fn read_mesh(path: impl AsRef<Path>, unit: Unit) -> Result<Mesh, MeshFileErr
     read_mesh_with(path, unit, &MeshOptions::default())
 }
 
-/// Reads a mesh as [`read_mesh`] does, of whatever size.
+/// Reads a mesh as [`read_mesh`] does, without checking its size.
 ///
 /// # Errors
 /// [`MeshFileError`], but never [`MeshFileError::Size`].
@@ -80,15 +80,14 @@ pub fn read_mesh_unchecked(path: impl AsRef<Path>, unit: Unit) -> Result<Mesh, M
 
 /// Reads a mesh.
 ///
-/// The format follows from the ending (`.ply .obj .stl .gltf .glb .xyz`, upper or lower case). The vertices come
-/// out in metres: the file's numbers times [`Unit::to_metres`]. glTF is in metres by its specification, and
-/// `unit` multiplies all the same: give [`Unit::Metre`] for a file that keeps to it. The file itself, and those that it names,
-/// have to be regular files. Where so many faces cover each other that they have [`LARGEST_AREA`], those that are there several
-/// times are left out.
+/// The format follows from the extension (`.ply .obj .stl .gltf .glb .xyz`, upper or lower case). The vertices come out in metres:
+/// the file's numbers times [`Unit::to_metres`]. glTF is in metres by its specification, but `unit` is applied to it too: give
+/// [`Unit::Metre`] for a file that conforms. The file itself, and those that it refers to, have to be regular files. If the area
+/// exceeds [`LARGEST_AREA`] because faces cover each other, repeated faces are removed.
 ///
 /// # Errors
 /// [`MeshFileError`], naming file, field, what was expected and found; [`MeshFileError::Size`] for a diameter
-/// outside 5 mm to 5 m, for an object far from the origin and for faces without end in one place.
+/// outside 5 mm to 5 m, for an object far from the origin and for an area above [`LARGEST_AREA`].
 pub fn read_mesh_with(
     path: impl AsRef<Path>,
     unit: Unit,
@@ -119,17 +118,16 @@ pub fn read_mesh_with(
     Ok(mesh)
 }
 
-/// The files that a mesh file may name.
+/// The files that a mesh file may refer to.
 struct Beside<'a> {
     mesh: &'a Path,
     allow_outside: bool,
-    /// Bytes read so far: a file may be named again and again.
+    /// Bytes read so far, since the same file can be referred to many times.
     read: Cell<u64>,
 }
 
 impl Beside<'_> {
-    /// A named file relative to the mesh file's folder; a name that is a path of another machine is looked for
-    /// by its last part.
+    /// A named file relative to the mesh file's folder; an absolute path of another machine is searched for by its last component.
     fn bytes(&self, name: &str) -> io::Result<Vec<u8>> {
         let folder = self.mesh.parent().filter(|f| !f.as_os_str().is_empty()).unwrap_or(Path::new("."));
         let direct = folder.join(PathBuf::from(name.replace('\\', "/")));
@@ -220,7 +218,7 @@ fn check_place_and_area(mesh: &Mesh, name: &str, diameter: f64) -> Result<(), Me
     Ok(())
 }
 
-/// A length as people say it.
+/// A length in a readable unit.
 fn length(metres: f64) -> String {
     if metres >= 1e6 || (metres > 0.0 && metres < 1e-6) {
         format!("{metres:.2e} m")
@@ -242,7 +240,7 @@ fn significant(value: f64) -> String {
     }
 }
 
-/// Decodes a PNG or JPEG texture, of at most so many pixels as any image.
+/// Decodes a PNG or JPEG texture, with the same limit on pixels as for any image.
 pub(crate) fn decode_texture(bytes: &[u8]) -> Result<RgbImage, String> {
     ImageFile::of_bytes(Path::new("texture"), bytes).rgb().map_err(|error| match error {
         ImageFileError::Content { reason, .. } => reason,
@@ -250,7 +248,7 @@ pub(crate) fn decode_texture(bytes: &[u8]) -> Result<RgbImage, String> {
     })
 }
 
-/// Reads and decodes a texture that `field` of `file` names.
+/// Reads and decodes a texture that `field` of `file` refers to.
 pub(crate) fn load_texture(
     file: &str,
     field: &str,
@@ -267,7 +265,7 @@ pub(crate) fn load_texture(
     decode_texture(&bytes).map_err(error)
 }
 
-/// Writes a file that nobody sees a part of, into a folder that is there already.
+/// Writes a file atomically into an existing folder.
 pub(crate) fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), MeshFileError> {
     write_atomically_with(path, |file| file.write_all(bytes))
         .map_err(|source| MeshFileError::Io { file: path.display().to_string(), source })
@@ -304,7 +302,7 @@ mod tests {
         }
     }
 
-    /// What reading a mesh of these bytes says.
+    /// The result of reading a mesh with this content, as text.
     fn said(folder: &Path, name: &str, content: &str, options: &MeshOptions) -> String {
         let path = folder.join(name);
         fs::write(&path, content).unwrap();
@@ -392,7 +390,7 @@ mod tests {
         let root = tempfile::tempdir().unwrap();
         fs::write(root.path().join("m.mtl"), "newmtl red\nKd 1 0 0\n").unwrap();
         let mut text = "mtllib m.mtl\n".repeat(1000) + "v 0 0 0\nv 1 0 0\nv 0 1 0\n";
-        // Looked up in a list, these took a minute.
+        // With a linear search in a list, these took a minute.
         (0..60_000).for_each(|k| text += &format!("usemtl material-{k}\nf 1 2 3\n"));
         let start = std::time::Instant::now();
         let options = MeshOptions { allow_outside: false, check_size: false };
@@ -411,7 +409,7 @@ mod tests {
         assert!(explain(vec![Vec3::x(); 400_000], vec![]).unwrap_err().contains("the same point"));
         let two = |k: u32| if k.is_multiple_of(2) { Vec3::zeros() } else { Vec3::x() };
         explain((0..400_000).map(two).collect(), vec![]).unwrap();
-        // Nearly equal ones at two places: all of their pairs are nearly as long.
+        // Nearly equal points at two places: all their pairs are nearly equally long.
         let nearly = |k: u32| two(k) + Vec3::new(0.0, f64::from(k / 2) * 1e-13, 0.0);
         explain((0..400_000).map(nearly).collect(), vec![]).unwrap();
         explain((0..400_000).map(|k| Vec3::x() * (f64::from(k) / 4e5)).collect(), vec![]).unwrap();
@@ -432,7 +430,7 @@ mod tests {
         let text = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 4\n".to_owned()
             + &"f 1 2 3\nf 3 1 2\n".repeat(100_000);
         assert_eq!(said(root.path(), "m.obj", &text, &MeshOptions::default()), "read 2 faces");
-        // A few of them are left as they are.
+        // A few repeated faces are kept.
         let few = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf 3 2 1\n";
         assert_eq!(said(root.path(), "m.obj", few, &MeshOptions::default()), "read 2 faces");
     }

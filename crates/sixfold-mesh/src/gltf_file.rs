@@ -1,9 +1,9 @@
-//! glTF 2.0 (Khronos 2021), as text with buffers beside it or inside, or binary (GLB).
+//! glTF 2.0 (Khronos 2021), as text with external or embedded buffers, or binary (GLB).
 //!
-//! The crate gltf gives the document and checks its references. Its accessors and GLB header trust lengths
-//! (a length of 3 in the header underflows, a count of zero too), its test of the document panics on an
-//! accessor that does not exist and its images on one without a type, and its node trees may be circles. So chunks, accessors and the walk over
-//! the nodes are read here, with every offset tested.
+//! The crate gltf parses the document and checks its references. But its accessors and GLB header trust lengths (a length of 3 in
+//! the header underflows, as does a count of zero), its validation panics on an accessor that does not exist, its images panic on
+//! one without a type, and its node trees may contain cycles. So chunks, accessors and the traversal of the nodes are implemented
+//! here, with every offset checked.
 
 use std::borrow::Cow;
 use std::collections::HashMap;
@@ -21,20 +21,20 @@ use crate::paint::{MAX_PIXELS, Paint, apply};
 use crate::ply::{excerpt, shown_name};
 use crate::{Mesh, MeshFileError, Resources, Unit};
 
-/// Most vertices and faces that a file may give by using its meshes again and again.
+/// Largest number of vertices and of faces of a file, whose nodes can use the same mesh many times.
 const MOST: usize = 1 << 24;
 
 /// Reads a glTF mesh from the bytes of a file, text or binary (GLB).
 ///
-/// All triangles of the default scene (else the first; else all nodes), moved by their nodes. Positions are in
-/// metres by the specification; they are multiplied by `unit` all the same. Kept: `NORMAL`, `COLOR_0` (linear
-/// there, sRGB here), base colour textures with the texture coordinates that they name, base colour factors.
-/// One texture on all faces stays as it is; only factors become vertex colours; anything else is stacked into
-/// one texture. Points and lines, skins, morph targets, alpha and texture transforms are left out; sparse
-/// accessors and compressed meshes are refused. `resources` gives buffers and images that lie beside the file.
+/// All triangles of the default scene (else of the first scene, else of all nodes), transformed by their nodes. Positions are in
+/// metres by the specification; they are multiplied by `unit` nevertheless. Kept: `NORMAL`, `COLOR_0` (linear there, sRGB here),
+/// base colour textures with the texture coordinates that they refer to, base colour factors. One texture on all faces stays as it
+/// is; only factors become vertex colours; anything else is stacked into one texture. Points and lines, skins, morph targets, alpha
+/// and texture transforms are left out; sparse accessors and compressed meshes are refused. `resources` provides external buffers
+/// and images.
 ///
 /// # Errors
-/// [`MeshFileError`] with the part of the document; `file` is the name that messages carry.
+/// [`MeshFileError`] with the part of the document; `file` is the name in messages.
 pub fn parse_gltf(
     bytes: &[u8],
     file: &str,
@@ -82,8 +82,8 @@ pub fn parse_gltf(
     parts.into_mesh(file)
 }
 
-/// The document, with all references tested by the crate; what its test
-/// and its accessors take for granted comes first.
+/// The document, with all references validated by the crate, after checks of what its validation and its accessors take for
+/// granted.
 fn checked_document(json: &[u8]) -> Result<Document, String> {
     let mut root = Gltf::from_slice_without_validation(json).map_err(|e| e.to_string())?.document.into_json();
     for (index, mesh) in root.meshes.iter().enumerate() {
@@ -130,7 +130,7 @@ fn chunks<'a>(bytes: &'a [u8], file: &str) -> Result<(&'a [u8], Option<&'a [u8]>
     Ok((json, Some(blob)))
 }
 
-/// The bytes of a `data:` URI, or of the file that a relative one names.
+/// The bytes of a `data:` URI, or of the file that a relative URI refers to.
 fn read_uri(uri: &str, file: &str, field: &str, resources: Resources<'_>) -> Result<Vec<u8>, MeshFileError> {
     if let Some(data) = uri.strip_prefix("data:") {
         return data.split_once(";base64,").and_then(|(_, text)| from_base64(text)).ok_or_else(|| {
@@ -216,7 +216,7 @@ struct Reader<'a> {
 }
 
 impl Reader<'_> {
-    /// Goes over the nodes with a stack of its own: a deep tree does not end the program.
+    /// Traverses the nodes with an explicit stack, so that a deep tree cannot overflow the call stack.
     fn walk(&mut self, document: &Document) -> Result<(), MeshFileError> {
         let nodes: Vec<_> = document.nodes().collect();
         let scene = document.default_scene().or_else(|| document.scenes().next());
@@ -321,7 +321,7 @@ impl Reader<'_> {
                 return Err(self.error(&format!("{name}.{attribute}"), &expected, length.to_string()));
             }
         }
-        // Normals stay upright on a stretched surface by the inverse transpose (up to a factor: the cofactors).
+        // The inverse transpose (up to a factor, the cofactors) keeps normals perpendicular to a stretched surface.
         let determinant = linear.determinant();
         let cofactors = Matrix3::from_columns(&[
             linear.column(1).cross(&linear.column(2)),
@@ -334,7 +334,7 @@ impl Reader<'_> {
         let colors = colors.map(|colors: Vec<[f32; 3]>| {
             colors.into_iter().map(|c| c.map(|c| to_byte(srgb_from_linear(c)))).collect()
         });
-        // Files have v downwards from the top.
+        // In the file, v points down from the top.
         let texcoords = texcoords.map(|t| {
             t.into_iter()
                 .map(|[u, v]| [u, 1.0 - v])
@@ -352,7 +352,7 @@ impl Reader<'_> {
         Ok(())
     }
 
-    /// Cuts a list of corners into triangles; a mirrored node turns them round.
+    /// Splits a list of corners into triangles; a mirrored node reverses their order.
     fn add_faces(&mut self, order: &[u32], mode: Mode, offset: usize, mirrored: bool, paint: usize) {
         let mut add = |[a, b, c]: [u32; 3]| {
             let face = if mirrored { [a, c, b] } else { [a, b, c] };
@@ -399,7 +399,7 @@ impl Reader<'_> {
             }
         };
         if let Paint::Texture(texture) = &paint {
-            // One image under many factors is many textures.
+            // The same image with many factors makes many textures.
             self.pixels += texture.as_slice().len();
             if self.pixels > MAX_PIXELS {
                 let expected = format!("at most {MAX_PIXELS} pixels in all");
@@ -518,7 +518,7 @@ impl Reader<'_> {
     }
 }
 
-/// Puts a primitive's attribute behind those before it; what has none gets `missing`.
+/// Appends a primitive's attribute; vertices without the attribute get `missing`.
 fn append<T: Clone>(all: &mut Option<Vec<T>>, own: Option<Vec<T>>, before: usize, count: usize, missing: T) {
     if own.is_none() && all.is_none() {
         return;
@@ -541,7 +541,7 @@ mod tests {
         bytes.into_inner()
     }
 
-    /// A unit square in z = 0 with texture coordinates and indices, and what follows it.
+    /// A unit square in z = 0 with texture coordinates and indices.
     fn square() -> Vec<u8> {
         let mut bin = Vec::new();
         for value in [[0.0f32, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]].as_flattened() {
@@ -610,7 +610,7 @@ mod tests {
     fn binary_with_texture_and_a_mirroring_node() {
         let mesh = parse(&textured()).unwrap();
         assert_eq!(mesh.vertices()[1], Vec3::new(-1.0, 0.0, 2.0));
-        // Mirroring turns the order round, so that the outside stays outside.
+        // Mirroring reverses the order, so that the faces still face outwards.
         assert_eq!(mesh.faces(), [[0, 2, 1], [0, 3, 2]]);
         assert_eq!(mesh.texcoords().unwrap()[0], [0.0, 0.0], "v goes up");
         assert_eq!(mesh.texture().unwrap()[(1, 0)], [10, 200, 30]);

@@ -1,7 +1,8 @@
 //! Triangle meshes of objects: reading, writing, measuring, sampling, simplifying.
 //!
-//! A [`Mesh`] is in metres and checked once, when it is made. Files do not say their unit, so readers ask
-//! for it ([`Unit`]) and refuse a size that no tabletop object has, with a message that names the likely unit.
+//! A [`Mesh`] is in metres and is checked once, when it is made. Files do not state their unit, so readers
+//! take it as an argument ([`Unit`]). They refuse a size that no tabletop object has, with a message that
+//! names the likely unit.
 //!
 //! ```
 //! use sixfold_mesh::{Unit, no_resources, parse_ply};

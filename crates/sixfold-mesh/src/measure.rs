@@ -7,14 +7,14 @@ use sixfold_geometry::{Pose, Vec3, sphere_directions};
 use crate::Mesh;
 
 impl Mesh {
-    /// The corners of the axis-parallel bounding box, smallest and largest, in metres.
+    /// The minimum and maximum corners of the axis-aligned bounding box, in metres.
     pub fn bounding_box(&self) -> (Vec3, Vec3) {
         let first = self.vertices()[0];
         self.vertices().iter().fold((first, first), |(low, high), v| (low.inf(v), high.sup(v)))
     }
 
-    /// The vertices that are outermost in one of `directions` directions spread over the sphere, in metres: enough to find
-    /// the object's box in an image.
+    /// The vertices that are outermost in one of `directions` directions spread over the sphere, in metres. They suffice
+    /// to compute the object's box in an image.
     pub fn extremes(&self, directions: usize) -> Vec<Vec3> {
         let vertices = self.vertices();
         let mut outermost: Vec<usize> = sphere_directions(directions)
@@ -42,8 +42,8 @@ impl Mesh {
     }
 
     /// A unit normal for every vertex: those given with the mesh, or computed from the faces, each weighted
-    /// by its angle at the vertex (Thürmer & Wüthrich 1998), which does not depend on how flat areas were cut
-    /// into triangles. Zero where no face of any area meets the vertex.
+    /// by its angle at the vertex (Thürmer & Wüthrich 1998), which does not depend on the triangulation of flat areas.
+    /// Zero where no face with an area meets the vertex.
     pub fn vertex_normals(&self) -> Vec<Vec3> {
         match self.normals() {
             Some(normals) => normals.to_vec(),
@@ -51,7 +51,7 @@ impl Mesh {
         }
     }
 
-    /// The mesh moved by a pose.
+    /// The mesh transformed by a pose.
     pub fn transformed(&self, pose: &Pose) -> Mesh {
         self.map_geometry(|v| pose.transform_point(v), |n| pose.transform_direction(n))
     }
@@ -59,7 +59,7 @@ impl Mesh {
     /// The mesh with every length multiplied by `factor`, which must be finite and positive.
     ///
     /// # Panics
-    /// When `factor` is not finite and positive: that is a mistake in the program.
+    /// When `factor` is not finite and positive, which is a programming error.
     pub fn scaled(&self, factor: f64) -> Mesh {
         assert!(factor.is_finite() && factor > 0.0, "scale factor {factor} is not finite and positive");
         self.map_geometry(|v| v * factor, |n| *n)
@@ -73,12 +73,12 @@ pub(crate) fn triangle_area([a, b, c]: &[Vec3; 3]) -> f64 {
 
 /// A key that is the same for the same place.
 pub(crate) fn position_key(point: &Vec3) -> [u64; 3] {
-    // Adding zero makes -0 the same place as 0.
+    // Adding zero turns -0 into 0.
     [point.x, point.y, point.z].map(|c| (c + 0.0).to_bits())
 }
 
-/// Angle-weighted vertex normals; zero where no face of any area meets the vertex. Vertices at the same
-/// place (split at a seam of the texture) share one, unless their faces cancel out (the two sides of a sheet).
+/// Angle-weighted vertex normals; zero where no face with an area meets the vertex. Vertices at the same place (split at a
+/// seam of the texture) share a normal, unless their faces cancel out (the two sides of a sheet).
 pub(crate) fn computed_normals(vertices: &[Vec3], faces: &[[u32; 3]]) -> Vec<Vec3> {
     let mut own = vec![Vec3::zeros(); vertices.len()];
     for face in faces {
@@ -131,7 +131,7 @@ mod tests {
             assert!((cube.surface_area() - 24.0).abs() < 1e-12);
             assert!((cube.diameter() - 12f64.sqrt()).abs() < 1e-12);
             assert_eq!(cube.bounding_box(), (Vec3::repeat(-1.0), Vec3::repeat(1.0)));
-            // Angle weighting gives the diagonal, however the sides are cut into triangles.
+            // Angle weighting gives the diagonal for any triangulation of the sides.
             for (v, n) in cube.vertices().iter().zip(cube.vertex_normals()) {
                 assert!((n - v.normalize()).norm() < 1e-12, "{v} {n}");
             }

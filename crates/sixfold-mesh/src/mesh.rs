@@ -1,4 +1,4 @@
-//! The triangle mesh every other crate works on: checked once, in metres.
+//! The triangle mesh that all other crates use: checked once, in metres.
 
 use std::collections::HashSet;
 
@@ -12,7 +12,7 @@ use crate::measure::{computed_normals, position_key};
 #[derive(Debug, Error, Clone, PartialEq)]
 #[non_exhaustive]
 pub enum MeshError {
-    /// There is not a single vertex.
+    /// There are no vertices.
     #[error("the mesh has no vertices")]
     Empty,
     /// A coordinate is NaN or infinite.
@@ -23,7 +23,7 @@ pub enum MeshError {
         /// Its coordinates.
         found: [f64; 3],
     },
-    /// A face names a vertex that does not exist.
+    /// A face refers to a vertex that does not exist.
     #[error("face {face} names vertex {found}, the mesh has {vertices} vertices")]
     FaceIndex {
         /// Index of the face.
@@ -63,7 +63,7 @@ impl Mesh {
     /// A mesh from vertices in metres and triangles.
     ///
     /// # Errors
-    /// [`MeshError`] when there is no vertex, a coordinate is not finite or a face names a missing vertex.
+    /// [`MeshError`] when there is no vertex, a coordinate is not finite or a face refers to a missing vertex.
     pub fn new(vertices: Vec<Vec3>, faces: Vec<[u32; 3]>) -> Result<Self, MeshError> {
         if vertices.is_empty() {
             return Err(MeshError::Empty);
@@ -87,7 +87,7 @@ impl Mesh {
         Err(MeshError::AttributeLength { attribute, found, vertices: self.vertices.len() })
     }
 
-    /// With unit normals, one per vertex; zero where one is not known.
+    /// With unit normals, one per vertex; zero where unknown.
     ///
     /// # Errors
     /// [`MeshError::AttributeLength`].
@@ -128,7 +128,7 @@ impl Mesh {
         &self.faces
     }
 
-    /// Unit normals per vertex, when known; a single one that is not known is zero.
+    /// Unit normals per vertex, when known; an unknown normal of a single vertex is zero.
     pub fn normals(&self) -> Option<&[Vec3]> {
         self.normals.as_deref()
     }
@@ -148,8 +148,7 @@ impl Mesh {
         self.texture.as_ref()
     }
 
-    /// The mesh without the faces that are there already: the same three vertices, whichever is named first and whichever way
-    /// round. The first of them stays.
+    /// The mesh without repeated faces, that is, faces with the same three vertices in any order. The first of them stays.
     pub fn without_repeated_faces(&self) -> Mesh {
         let mut seen = HashSet::with_capacity(self.faces.len());
         let place = |i: u32| position_key(&self.vertices[i as usize]);
@@ -174,9 +173,9 @@ impl Mesh {
         }
     }
 
-    /// All faces of several meshes in one; vertices follow in order. Normals, colours and texture
-    /// coordinates stay where every part has them; where only some have a normal, the others' are computed,
-    /// where only some have a colour, the others are grey. A texture stays only when all parts share it.
+    /// All faces of several meshes in one; vertices follow in order. Normals, colours and texture coordinates are kept if all
+    /// parts have them. If only some parts have normals, the others' are computed; if only some have colours, the others
+    /// become grey. A texture is kept only if all parts share it.
     ///
     /// # Errors
     /// [`MeshError::Empty`] without any part.
@@ -212,18 +211,18 @@ impl Mesh {
     }
 }
 
-/// A unit vector; `None` where the length is `least` or less, not finite or too large to be computed.
+/// A unit vector; `None` if the length is `least` or less, not finite, or too large to be computed.
 pub(crate) fn direction(vector: &Vec3, least: f64) -> Option<Vec3> {
     vector.try_normalize(least).filter(|n| (n.norm() - 1.0).abs() < 1e-6)
 }
 
-/// What a reader found in a file, before it is checked.
+/// The content of a file before it is checked.
 #[derive(Debug, Default)]
 pub(crate) struct Parts {
     /// In metres.
     pub vertices: Vec<Vec3>,
     pub faces: Vec<[u32; 3]>,
-    /// As in the file: of any length, perhaps zero or NaN.
+    /// As in the file: of any length, possibly zero or NaN.
     pub normals: Option<Vec<Vec3>>,
     pub colors: Option<Vec<[u8; 3]>>,
     pub texcoords: Option<Vec<[f32; 2]>>,
@@ -231,7 +230,7 @@ pub(crate) struct Parts {
 }
 
 impl Parts {
-    /// The checked mesh. Normals are made unit; one without a direction is computed from the faces.
+    /// The checked mesh. Normals are normalised; a normal without a direction is computed from the faces.
     pub(crate) fn into_mesh(self, file: &str) -> Result<Mesh, MeshFileError> {
         let in_file = |source| MeshFileError::Mesh { file: file.to_owned(), source };
         let mut mesh = Mesh::new(self.vertices, self.faces).map_err(in_file)?;

@@ -1,30 +1,31 @@
-//! Whether a `models_info.json` describes the meshes beside it. Diameters scale all errors of poses, and symmetries forgive
-//! them: with a file of other meshes, in another unit or with a wrong axis, wrong poses count as right.
+//! Whether a `models_info.json` describes the meshes beside it. Thresholds of pose errors depend on the diameter, and symmetries
+//! accept rotated poses: with a file for other meshes, in another unit or with a wrong axis, wrong poses would count as right.
 //!
-//! The tolerances leave room for simplified meshes and for symmetries that hold but for a detail. The meshes of LM-O are those of
-//! their file, and their symmetries keep their boxes; HOPE's are up to 0.5 mm off, 0.5 % of a diameter (`tests/real_data.rs`).
+//! The tolerances allow for simplified meshes and for symmetries that hold except for a detail. LM-O's file matches its meshes,
+//! and the symmetries preserve the bounding boxes; in HOPE, the differences reach 0.5 mm, 0.5 % of a diameter
+//! (`tests/real_data.rs`).
 
 use sixfold_geometry::{Pose, Vec3};
 
 use crate::models_info::{ModelInfo, ModelsInfo};
 use crate::{Mesh, MeshFileError};
 
-/// How far diameter and corners of the box may be off, as a fraction of the mesh's diameter.
+/// Tolerance of the diameter and of the box's corners, as a fraction of the mesh's diameter.
 const SIZE_TOLERANCE: f64 = 0.05;
 /// How far a symmetry may move the sides of the mesh's box, as a fraction of the diameter, where poses are scored with it.
 const SYMMETRY_TOLERANCE: f64 = 0.2;
-/// The same wherever a mesh is opened: trainings report a symmetry that the mesh does not have and use it all the same, but none
-/// takes a mesh out of its place.
+/// The same tolerance whenever a mesh is opened. Trainings report a symmetry that the mesh does not have and use it nevertheless,
+/// but a symmetry that moves the mesh away is always refused.
 const PLACE_TOLERANCE: f64 = 1.0;
-/// Rotations at which a continuous symmetry is tested, with that of a full turn.
+/// Rotations at which a continuous symmetry is tested, including a full turn.
 const ROTATIONS: usize = 8;
 
-/// What does not fit a mesh: field, found, expected.
+/// A mismatch with a mesh: field, found value, expected value.
 type Mismatch = (String, String, String);
 
 impl ModelsInfo {
     /// Compares diameter and box of object `id` with its mesh, and whether its symmetries leave the mesh where it is; `file` is
-    /// the name that messages carry. An object of which nothing is known passes.
+    /// the name in messages. An object without an entry passes.
     ///
     /// # Errors
     /// [`MeshFileError::Info`] naming object and field.
@@ -36,7 +37,7 @@ impl ModelsInfo {
         })
     }
 
-    /// Whether the symmetries of object `id` map a mesh of it onto itself, as far as its box tells.
+    /// Checks that the symmetries of object `id` map its mesh onto itself, as far as the bounding box shows.
     ///
     /// # Errors
     /// As [`ModelsInfo::check_mesh`].
@@ -81,7 +82,7 @@ impl ModelInfo {
         Ok(())
     }
 
-    /// A symmetry maps the mesh onto itself: the box of the mesh stays where it is.
+    /// Checks that every symmetry leaves the mesh's bounding box in place, as a motion of the mesh onto itself does.
     fn check_symmetries(&self, mesh: &Mesh, diameter: f64, tolerance: f64) -> Result<(), Mismatch> {
         let tolerance = tolerance * diameter;
         let test = |field: String, motion: &Pose| {
@@ -109,7 +110,7 @@ impl ModelInfo {
     }
 }
 
-/// How far a motion moves the sides of the mesh's axis-aligned box; infinite where it is no motion.
+/// How far a motion moves the sides of the mesh's axis-aligned box; infinite if it is not a rigid motion.
 fn box_motion(mesh: &Mesh, motion: &Pose) -> f64 {
     let ((low, high), infinite) = (mesh.bounding_box(), Vec3::repeat(f64::INFINITY));
     let moved = mesh.vertices().iter().map(|v| motion.transform_point(v));
@@ -168,11 +169,11 @@ mod tests {
         };
         // Half a turn about the vertical through the centre.
         assert_eq!(check(&discrete("-1,0,0,20, 0,-1,0,0, 0,0,1,0, 0,0,0,1"), 123.288, -20.0), Ok(()));
-        // A quarter of one is none for a box of 60 x 100 mm, nor is half a turn about another axis.
+        // A quarter turn is not a symmetry of a box of 60 x 100 mm, nor is half a turn about another axis.
         let error = check(&discrete("0,0,1,0, 0,1,0,0, -1,0,0,0, 0,0,0,1"), 123.288, -20.0).unwrap_err();
         assert!(error.contains("symmetries_discrete[0]") && error.contains("onto itself"), "{error}");
         assert!(check(&discrete("-1,0,0,90, 0,-1,0,0, 0,0,1,0, 0,0,0,1"), 123.288, -20.0).is_err());
-        // Far from the mesh it is refused even where symmetries are not scored with.
+        // An axis far from the mesh is refused even where symmetries are not used for scores.
         let far = format!(
             r#"{{"4": {{"diameter": 123.288, "min_x": -20, "min_y": -20, "min_z": -50, "size_x": 60,
             "size_y": 40, "size_z": 100 {}}}}}"#,

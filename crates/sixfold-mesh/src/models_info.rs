@@ -14,11 +14,11 @@ use crate::file::write_atomically;
 use crate::{Mesh, MeshFileError};
 
 const MILLIMETRE: f64 = 1e-3;
-/// No number in the file is larger: a kilometre. What is larger loses its digits, or is none when it is squared.
+/// Largest number accepted in the file: a kilometre. Larger numbers lose digits, or overflow when squared.
 const LARGEST: f64 = 1e6;
-/// Most discrete symmetries of an object: nuts have 12, a dodecahedron 60.
+/// Largest number of discrete symmetries of an object: nuts have 12, a dodecahedron 60.
 const MOST_DISCRETE: usize = 512;
-/// Most symmetries of an object when continuous ones are taken in BOP's steps: 12 discrete ones about four axes.
+/// Largest number of symmetries of an object with continuous ones in BOP's steps: 12 discrete ones about four axes.
 const MOST_SYMMETRIES: usize = 16_384;
 
 /// A symmetry under every rotation about an axis.
@@ -38,7 +38,7 @@ impl ContinuousSymmetry {
     }
 }
 
-/// What BOP notes of one object model; lengths in metres.
+/// BOP's data of one object model; lengths in metres.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ModelInfo {
     /// Largest distance between two vertices.
@@ -49,7 +49,7 @@ pub struct ModelInfo {
     pub size: Vec3,
     /// Rigid transformations that map the object onto itself, besides the identity.
     pub symmetries_discrete: Vec<Pose>,
-    /// Axes about which the object may turn freely.
+    /// Axes about which the object may rotate freely.
     pub symmetries_continuous: Vec<ContinuousSymmetry>,
 }
 
@@ -69,7 +69,7 @@ impl ModelInfo {
         }
     }
 
-    /// Adds a symmetry: the object may rotate freely about this axis of its frame, through the middle of its box (a file's origin
+    /// Adds a symmetry: the object may rotate freely about this axis of its frame, through the centre of its box (a file's origin
     /// may be anywhere).
     pub fn rotates_freely_about(&mut self, axis: Vec3) {
         let offset = self.min + self.size * 0.5;
@@ -84,12 +84,12 @@ impl ModelInfo {
     /// All transformations under which the object looks the same, the identity first: each discrete one
     /// (with the identity) followed by each step of every continuous one, in the order of BOP's evaluation.
     ///
-    /// `max_step` is the largest way that the vertex farthest from a continuous axis travels in one step, as
-    /// a fraction of the diameter: `ceil(pi / max_step)` steps make a full turn (Hodan et al. 2020,
-    /// section 2.2). [`ModelInfo::BOP_MAX_STEP`] gives 315 steps.
+    /// `max_step` is the largest distance that the vertex farthest from a continuous axis moves in one step, as a fraction of the
+    /// diameter: `ceil(pi / max_step)` steps make a full turn (Hodan et al. 2020, section 2.2). [`ModelInfo::BOP_MAX_STEP`] gives
+    /// 315 steps.
     ///
     /// # Panics
-    /// When `max_step` is not at least 1e-6: that is a mistake in the program.
+    /// When `max_step` is less than 1e-6, which is a programming error.
     pub fn symmetry_poses(&self, max_step: f64) -> Vec<Pose> {
         assert!(max_step >= 1e-6, "max_step {max_step} is not at least 1e-6");
         let steps = (std::f64::consts::PI / max_step).ceil().max(1.0) as usize;
@@ -109,7 +109,7 @@ impl ModelInfo {
     }
 }
 
-/// The content of a `models_info.json`: what is known of each object, by its id.
+/// The content of a `models_info.json`: the data of each object, by its id.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct ModelsInfo(pub BTreeMap<u32, ModelInfo>);
 
@@ -126,7 +126,7 @@ impl ModelsInfo {
         Self::parse(&bytes, &file)
     }
 
-    /// Reads the bytes of a `models_info.json`; `file` is the name that messages carry.
+    /// Reads the bytes of a `models_info.json`; `file` is the name in messages.
     ///
     /// # Errors
     /// As [`ModelsInfo::read`].
@@ -146,8 +146,8 @@ impl ModelsInfo {
         Ok(ModelsInfo(infos))
     }
 
-    /// Writes a `models_info.json` in millimetres, rounded to a picometre so that a number read
-    /// comes out as it was; all or nothing.
+    /// Writes a `models_info.json` in millimetres, rounded to a picometre so that a number that was read is written unchanged.
+    /// The file is written atomically.
     ///
     /// # Errors
     /// [`MeshFileError::Io`].
@@ -155,7 +155,7 @@ impl ModelsInfo {
         write_atomically(path.as_ref(), self.to_text().as_bytes())
     }
 
-    /// What [`ModelsInfo::write`] writes.
+    /// The text that [`ModelsInfo::write`] writes.
     pub fn to_text(&self) -> String {
         let objects: Vec<String> =
             self.0.iter().map(|(id, info)| format!(" \"{id}\": {}", to_json(info))).collect();
@@ -199,7 +199,7 @@ fn to_json(info: &ModelInfo) -> Value {
     Value::Object(object)
 }
 
-/// What sort of value this is, for messages.
+/// The kind of a value, for messages.
 fn kind(value: &Value) -> String {
     match value {
         Value::Array(items) => format!("an array of {}", items.len()),
@@ -248,7 +248,7 @@ impl Fields<'_> {
             .ok_or_else(|| self.error(field, &expected, kind(value)))
     }
 
-    /// Every symmetry is tried for every pose: a file may not ask for more than anyone can wait for.
+    /// Every symmetry is evaluated for every pose, so their number is limited to keep the time reasonable.
     fn check_counts(&self) -> Result<(), MeshFileError> {
         let (discrete, continuous) =
             (self.list("symmetries_discrete")?.len(), self.list("symmetries_continuous")?.len());
@@ -353,7 +353,7 @@ mod tests {
             let moved = turn.transform_point(&Vec3::new(1.005, 0.0, 0.0));
             assert!((moved - Vec3::new(0.005 + angle.cos(), angle.sin(), 0.0)).norm() < 1e-12);
         }
-        // Both kinds: each discrete one with each rotation, the turn applied last.
+        // Both kinds: each discrete symmetry with each rotation, the rotation applied last.
         let mut both = infos.0[&10].clone();
         both.symmetries_continuous = infos.0[&2].symmetries_continuous.clone();
         let poses = both.symmetry_poses(1.0);

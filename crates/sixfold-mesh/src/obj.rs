@@ -1,7 +1,7 @@
 //! Wavefront OBJ with its MTL materials.
 //!
-//! Our own parser: tobj 4.0.5, tried first, gives a texture array of another length than the vertices for
-//! `f 1 2/1 3`, refuses a file in which only some vertices have a colour, and its errors name no line.
+//! We have our own parser: tobj 4.0.5, tried first, returns a texture array of another length than the vertices for
+//! `f 1 2/1 3`, refuses a file in which only some vertices have a colour, and its errors do not state the line.
 
 use std::collections::HashMap;
 
@@ -13,7 +13,7 @@ use crate::paint::{MAX_PIXELS, Paint, apply};
 use crate::ply::{excerpt, shown_name};
 use crate::{Mesh, MeshFileError, Resources, Unit};
 
-/// The colour of a material that has none: the default of MTL, 0.8.
+/// The colour of a material without one: MTL's default, 0.8.
 const PLAIN: [u8; 3] = [204; 3];
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -31,7 +31,7 @@ struct ObjMaterial {
     texture: Option<(String, String)>,
 }
 
-/// Where a message points to.
+/// The place that a message states.
 struct Line<'a> {
     file: &'a str,
     number: usize,
@@ -56,7 +56,7 @@ impl Line<'_> {
         Ok(numbers)
     }
 
-    /// An index as OBJ counts: from 1 at the start, from -1 at the end.
+    /// An index in OBJ's form: from 1 at the start, from -1 at the end.
     fn index(&self, word: &str, count: usize, what: &str) -> Result<usize, MeshFileError> {
         let found = word.parse::<i64>().ok();
         let index = match found {
@@ -71,7 +71,7 @@ impl Line<'_> {
     }
 }
 
-/// The lines of a text, with those that end in a backslash joined to the next; gives number and text.
+/// The lines of a text, with lines that end in a backslash joined to the next; returns number and text.
 fn lines(text: &str) -> impl Iterator<Item = (usize, String)> + '_ {
     let mut source = text.lines().enumerate();
     std::iter::from_fn(move || {
@@ -92,13 +92,13 @@ fn lines(text: &str) -> impl Iterator<Item = (usize, String)> + '_ {
 /// * `vt` and `vn`; a vertex used with several of them is split;
 /// * faces `f` with indices from either end; polygons become triangle fans; without faces: a point model. With
 ///   faces, vertices that no face uses are left out;
-/// * `mtllib` and `usemtl`: `map_Kd` textures (with which `Kd` is not multiplied) and `Kd` colours. One
-///   texture on all faces stays as it is; only colours become vertex colours; anything else is stacked into
-///   one texture. A material that no `mtllib` knows is grey (0.8).
+/// * `mtllib` and `usemtl`: `map_Kd` textures (with which `Kd` is not multiplied) and `Kd` colours. One texture on
+///   all faces stays as it is; if there are only colours, they become vertex colours; anything else is stacked into
+///   one texture. A material that no `mtllib` defines is grey (0.8).
 ///
 /// # Errors
 /// [`MeshFileError`] with the line; also when a named material or texture file is missing ([`MeshFileError::Named`]).
-/// `file` is the name that messages carry.
+/// `file` is the name in messages.
 pub fn parse_obj(
     bytes: &[u8],
     file: &str,
@@ -197,7 +197,7 @@ pub fn parse_obj(
         vertices: order.iter().map(|c| vertices[c.vertex]).collect(),
         faces,
         normals: order.iter().any(|c| c.normal.is_some()).then(|| {
-            // A corner without a normal gets that of the faces around it.
+            // A corner without a normal gets the normal of the faces around it.
             order.iter().map(|c| c.normal.map_or(Vec3::zeros(), |n| normals[n])).collect()
         }),
         colors: any_color.then(|| order.iter().map(|c| colors[c.vertex].unwrap_or([128; 3])).collect()),
@@ -301,7 +301,7 @@ fn parse_library(
     Ok(())
 }
 
-/// The file name of a texture line: what is left behind options such as `-s 1 1 1` and `-clamp on`.
+/// The file name of a texture line: the rest of the line after options such as `-s 1 1 1` and `-clamp on`.
 fn without_options(rest: &str) -> String {
     let mut words: Vec<&str> = rest.split_ascii_whitespace().collect();
     while words.len() > 1 && words[0].starts_with('-') {
@@ -391,7 +391,7 @@ mod tests {
         let texture = mesh.texture().unwrap();
         for (face, color) in [[10, 20, 30], [200, 100, 50], [255, 0, 0]].into_iter().enumerate() {
             let corners = mesh.faces()[face].map(|v| mesh.texcoords().unwrap()[v as usize]);
-            // The middle of the face, and points close to its corners.
+            // The centre of the face, and points close to its corners.
             for weights in [[0.34, 0.33, 0.33], [0.9, 0.05, 0.05], [0.05, 0.9, 0.05], [0.05, 0.05, 0.9]] {
                 let uv = [0, 1].map(|k| corners.iter().zip(weights).map(|(c, w)| c[k] * w).sum::<f32>());
                 let x = (uv[0] * texture.width() as f32) as usize;

@@ -1,21 +1,22 @@
-//! Several materials into what a mesh can carry: one texture, or one colour a vertex.
+//! Combines several materials into the forms that a mesh supports: one texture, or one colour per vertex.
 
 use sixfold_geometry::RgbImage;
 
 use crate::MeshFileError;
 use crate::mesh::Parts;
 
-/// Rows of repeated edge between the textures of an atlas, against bleeding when they are interpolated.
+/// Rows of repeated border pixels between the textures of an atlas, so that interpolation does not mix
+/// textures.
 const GUTTER: usize = 2;
 /// Maximum number of pixels of an atlas, and of all textures of a mesh.
 pub(crate) const MAX_PIXELS: usize = 1 << 28;
 
-/// What a material gives to a surface.
+/// The appearance that a material gives to a surface.
 #[derive(Debug, Clone)]
 pub(crate) enum Paint {
     /// One colour, sRGB.
     Color([u8; 3]),
-    /// An image to be looked up by texture coordinates.
+    /// An image indexed by texture coordinates.
     Texture(RgbImage),
 }
 
@@ -23,8 +24,9 @@ pub(crate) enum Paint {
 ///
 /// * only colours: they become vertex colours, unless the file has its own;
 /// * one texture on every face: it becomes the mesh's;
-/// * else all textures and colours are stacked in one texture. Each face is moved by whole turns to where its
-///   coordinates start within the texture; what still lies outside (a tiled texture) is clamped to the edge.
+/// * else all textures and colours are stacked in one texture. The coordinates of each face are shifted by
+///   whole numbers so that they start within the texture; coordinates that are still outside (a tiled
+///   texture) are clamped to the border.
 ///
 /// Faces of different paints must not share vertices.
 pub(crate) fn apply(
@@ -112,7 +114,7 @@ fn stack(
     for (face, &paint) in parts.faces.iter().zip(face_paints) {
         let corners = face.map(|v| source[v as usize]);
         let turn = [0, 1].map(|k| corners.iter().map(|uv| uv[k]).fold(f32::INFINITY, f32::min).floor());
-        // A face that touches 1 from below starts at zero after no rotation.
+        // A face that reaches 1 only from below is not shifted.
         let (w, h) = size(&paints[paint]);
         for (&v, uv) in face.iter().zip(corners) {
             if std::mem::replace(&mut moved[v as usize], true) {

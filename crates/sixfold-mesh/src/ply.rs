@@ -1,9 +1,9 @@
 //! PLY, the Polygon File Format (Turk 1994): ascii and binary of both byte orders.
 //!
-//! Our own parser, because the crates considered keep every row of every element as a value of its own (with
-//! its property names compared as strings) and take an element's count at its word: `element x 4000000000`
-//! without properties needs no bytes in a binary file and grows a crate's array until memory is gone. Here a
-//! count is tested against the bytes that are left before anything is allocated, rows go straight into the
+//! We have our own parser, because the crates considered store every row of every element as a separate value
+//! (with its property names compared as strings) and trust an element's count: `element x 4000000000` without
+//! properties needs no bytes in a binary file, but a crate's array grows until memory is exhausted. Here a count
+//! is checked against the bytes that are left before anything is allocated, rows are read directly into the
 //! mesh's arrays, and an error names element, row and property.
 
 use std::collections::HashMap;
@@ -88,10 +88,10 @@ impl Element {
         self.properties.iter().position(|p| p.count.is_some() && names.contains(&p.name.as_str()))
     }
 
-    /// The least bytes that a row can take in the body.
+    /// The minimum number of bytes of a row in the body.
     fn least_bytes(&self, encoding: Encoding) -> usize {
         match encoding {
-            // A digit and what separates it from the next.
+            // A digit and a separator.
             Encoding::Ascii => 2 * self.properties.len(),
             _ => self.properties.iter().map(|p| p.count.unwrap_or(p.scalar).bytes()).sum(),
         }
@@ -102,13 +102,13 @@ struct Header {
     encoding: Encoding,
     elements: Vec<Element>,
     texture: Option<String>,
-    /// Where the body starts.
+    /// Start of the body in the bytes of the file.
     body: usize,
-    /// How many lines the header has.
+    /// Number of lines of the header.
     lines: usize,
 }
 
-/// Splits off a line that ends in `\n`, `\r\n` or `\r`; gives the line and where the next one starts.
+/// Splits off a line that ends in `\n`, `\r\n` or `\r`; returns the line and the start of the next one.
 fn split_line(bytes: &[u8], start: usize) -> Option<(&[u8], usize)> {
     let rest = bytes.get(start..).filter(|rest| !rest.is_empty())?;
     let end = rest.iter().position(|&b| b == b'\n' || b == b'\r').unwrap_or(rest.len());
@@ -151,7 +151,7 @@ fn parse_header(bytes: &[u8], file: &str) -> Result<Header, MeshFileError> {
             [] => {}
             ["end_header"] => break,
             ["comment", key, ..] if key.eq_ignore_ascii_case("TextureFile") => {
-                // The name may hold spaces: everything behind the key.
+                // The name is everything after the key, since it may contain spaces.
                 let name = line.split_once(*key).map_or("", |(_, rest)| rest).trim();
                 if !name.is_empty() {
                     texture.get_or_insert_with(|| name.to_owned());
@@ -204,7 +204,7 @@ pub(crate) fn shown_name(text: &str) -> String {
     shortened(text, 300)
 }
 
-/// At most `most` characters; control characters, which a terminal would obey, are replaced.
+/// At most `most` characters; control characters, which a terminal would execute, are replaced.
 fn shortened(text: &str, most: usize) -> String {
     let shown = |c: char| if c.is_control() { char::REPLACEMENT_CHARACTER } else { c };
     let mut short: String = text.chars().take(most).map(shown).collect();
@@ -214,7 +214,7 @@ fn shortened(text: &str, most: usize) -> String {
     short
 }
 
-/// Reads the numbers of the body in turn; every number of a PLY type is exact in `f64`.
+/// Reads the numbers of the body in order; every number of a PLY type is exact in `f64`.
 struct Body<'a> {
     bytes: &'a [u8],
     at: usize,
@@ -254,7 +254,7 @@ impl<'a> Body<'a> {
         while let Some(&byte) = self.bytes.get(self.at) {
             match byte {
                 b'\n' => self.line += 1,
-                // Old Macintosh files end lines in \r alone.
+                // Old Macintosh files end lines with \r alone.
                 b'\r' if self.bytes.get(self.at + 1) != Some(&b'\n') => self.line += 1,
                 b' ' | b'\t' | b'\r' => {}
                 _ => break,
@@ -344,14 +344,14 @@ impl<'a> Body<'a> {
                 &length.to_string(),
             ));
         }
-        // Values are read one by one, so a length that lies ends at the end of the file.
+        // Values are read one by one, so reading with a wrong length stops at the end of the file.
         for _ in 0..length as u64 {
             out.push(self.value(property.scalar, element, row, &property.name)?);
         }
         Ok(())
     }
 
-    /// Tests that a row is at its end (ascii only).
+    /// Checks that a row is at its end (ascii only).
     fn end_row(&mut self, element: &Element, row: usize) -> Result<(), MeshFileError> {
         if self.encoding != Encoding::Ascii {
             return Ok(());
@@ -399,16 +399,17 @@ const SKIPPED: usize = KEPT.len();
 /// Reads a PLY mesh from the bytes of a file.
 ///
 /// * vertices: `x y z`, times `unit`, in metres out;
-/// * normals `nx ny nz`, made unit; where one is zero or not finite, the normal of the faces around it;
+/// * normals `nx ny nz`, normalised; where a normal is zero or not finite, it is computed from the faces around
+///   it;
 /// * colours `red green blue` (also `diffuse_red` ...): integers 0 to 255 (`ushort`: 0 to 65535), floats 0 to 1;
 /// * texture coordinates per vertex (`texture_u texture_v`, `u v` or `s t`) or per face corner (list
 ///   `texcoord`; vertices are then split at the seams), kept when `comment TextureFile NAME` names a texture,
-///   which `resources` gives;
-/// * polygons with more than three corners become triangle fans, those with fewer are left out;
-/// * all other properties and elements are skipped; no faces makes a point model.
+///   which is read through `resources`;
+/// * polygons with more than three corners become triangle fans, faces with fewer are left out;
+/// * all other properties and elements are skipped; a file without faces gives a point model.
 ///
 /// # Errors
-/// [`MeshFileError`]: `file` is the name that messages carry.
+/// [`MeshFileError`]; `file` is the name in messages.
 pub fn parse_ply(
     bytes: &[u8],
     file: &str,
@@ -559,7 +560,7 @@ fn read_vertices(
             normals.push(Vec3::new(v[3], v[4], v[5]));
         }
         if has_colors {
-            // A cast saturates and makes NaN zero.
+            // The cast saturates and turns NaN into zero.
             colors.push([v[6], v[7], v[8]].map(|c| (c * color_scale).round() as u8));
         }
         if has_texcoords {
@@ -639,8 +640,8 @@ fn read_faces(
     Ok(())
 }
 
-/// Gives every vertex one texture coordinate: the first one met stays with the vertex, every other one
-/// gets a copy of the vertex behind the others.
+/// Gives every vertex one texture coordinate: the first one stays with the vertex, and every other one gets a
+/// copy of the vertex, appended at the end.
 fn split_at_seams(parts: &mut Parts, corner_texcoords: &[[[f32; 2]; 3]]) {
     let mut texcoords: Vec<Option<[f32; 2]>> = vec![None; parts.vertices.len()];
     let mut copies: HashMap<(u32, [u32; 2]), u32> = HashMap::new();
@@ -695,7 +696,7 @@ mod tests {
             assert_eq!(mesh.vertices()[0], Vec3::new(0.0005, 0.0, 0.0));
             assert_eq!(mesh.faces(), [[0, 1, 2], [0, 2, 3]]);
             assert_eq!(mesh.colors().unwrap()[2], [7, 8, 9]);
-            // One normal is NaN and one is zero: both come from the faces.
+            // One normal is NaN and one is zero: both are computed from the faces.
             assert!(mesh.normals().unwrap().iter().all(|n| (n - Vec3::z()).norm() < 1e-12));
         }
     }

@@ -1,4 +1,4 @@
-//! Writing PLY: ascii to read, binary little endian (32 bit floats) to ship.
+//! Writing PLY: ascii for people, binary little endian (32 bit floats) for compact files.
 
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
@@ -19,7 +19,7 @@ pub enum PlyFormat {
 
 /// Writes a mesh with its normals, colours and texture coordinates, lengths in `unit` as 32 bit floats. A
 /// texture becomes a PNG beside the file, of the same name, which `comment TextureFile` names. Each file is
-/// written aside and then renamed: a reader sees the old or the new one, never a part.
+/// written under a temporary name and then renamed: readers get the old file or the new one, never a part.
 ///
 /// # Errors
 /// [`MeshFileError::Io`]; [`MeshFileError::Field`] when a coordinate does not fit a 32 bit float in `unit`.
@@ -247,7 +247,7 @@ mod tests {
             let mut bytes = ply_bytes(&mesh, Unit::Metre, format, None);
             let cut = cut.index(bytes.len());
             let parsed = parse_ply(&bytes[..cut], "x", Unit::Metre, &no_resources);
-            // A text that is cut within its last number cannot be told from a whole one.
+            // A text that is cut within its last number cannot be distinguished from a whole one.
             prop_assert!(parsed.is_err() || (ascii && cut + 16 > bytes.len()));
             let at = at.index(bytes.len());
             bytes[at] = to;

@@ -1,4 +1,4 @@
-//! Points spread evenly over the surface of a mesh.
+//! Random points on the surface of a mesh, uniform by area.
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -23,11 +23,11 @@ impl Mesh {
     /// The same mesh and seed give the same points. Empty when the mesh has no face with an area (a point
     /// model).
     ///
-    /// Points in a triangle after Osada et al. 2002, equation 1.
+    /// Points in a triangle follow Osada et al. 2002, equation 1.
     pub fn sample_surface(&self, n: usize, seed: u64) -> SurfaceSamples {
         let mut samples = SurfaceSamples::default();
         let mut total = 0.0;
-        // The running sum of the areas, for the faces that have one.
+        // The cumulative sum of the areas, for faces with an area.
         let mut areas: Vec<(f64, u32)> = Vec::with_capacity(self.faces().len());
         for face in 0..self.faces().len() {
             let area = triangle_area(&self.triangle(face));

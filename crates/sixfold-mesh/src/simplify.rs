@@ -1,8 +1,7 @@
 //! Fewer triangles by edge collapse with quadric error metrics (Garland & Heckbert 1997).
 //!
-//! The plane quadrics are weighted by area, open borders are held by planes upright on them (section 6 of the
-//! paper). A collapse that would turn a face over, or glue parts that do not border on each other
-//! (the link condition of Dey et al. 1999), is left out.
+//! The plane quadrics are weighted by area; open borders are preserved by planes perpendicular to them (section 6 of the paper).
+//! A collapse that would flip a face, or join parts that are not adjacent (the link condition of Dey et al. 1999), is skipped.
 
 use std::cmp::Ordering;
 use std::collections::{BinaryHeap, HashMap};
@@ -13,16 +12,16 @@ use sixfold_geometry::{KdTree, Vec3};
 use crate::Mesh;
 use crate::measure::position_key;
 
-/// How much more the plane on an open border weighs than a face.
+/// Weight of the plane at an open border relative to a face.
 const BORDER_WEIGHT: f64 = 100.0;
-/// A vertex with more faces than this is left alone once the work is used up.
+/// A vertex with more faces than this is not collapsed once the work limit is reached.
 const HUB: usize = 64;
-/// Faces visited, for each face of the mesh and at all, until then: several times what the finest scans take. Where thousands of
-/// faces meet in one vertex again and again, the time would grow with their square.
+/// The work limit, in visited faces: per face of the mesh, and in total. It is several times what the finest scans need. Without
+/// it, the time would grow quadratically where thousands of faces keep meeting in one vertex.
 const WORK: (u64, u64) = (200, 20_000_000);
-/// Where so many times the faces asked for are left, those that are there several times are left out.
+/// If more than this many times the requested faces remain, repeated faces are removed.
 const FAR_TOO_MANY: usize = 4;
-/// Least cosine between a face's normal before and after a collapse.
+/// Minimum cosine between a face's normals before and after a collapse.
 const MIN_COSINE: f64 = 0.2;
 
 /// The quadric `x^T A x + 2 b^T x + c`: a weighted sum of squared distances to planes.
@@ -55,8 +54,8 @@ impl Quadric {
     }
 }
 
-/// An edge that may be collapsed; the heap gives the cheapest first, ties by vertex so that the same mesh
-/// always comes out the same.
+/// An edge that may be collapsed. The heap returns the cheapest first, with ties broken by vertex so that the result is
+/// reproducible.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Candidate {
     cost: f64,
@@ -83,28 +82,27 @@ struct Collapser {
     points: Vec<Vec3>,
     faces: Vec<[u32; 3]>,
     alive: Vec<bool>,
-    /// Those that are gone among them, up to half of them.
+    /// The faces of each vertex; up to half of them may have been removed.
     faces_of: Vec<Vec<u32>>,
-    /// How many of a vertex's faces are gone.
+    /// How many faces in each vertex's list have been removed.
     gone_of: Vec<u32>,
     quadrics: Vec<Quadric>,
     stamps: Vec<u32>,
     heap: BinaryHeap<Candidate>,
-    /// How many more faces may be visited before hubs are left alone.
+    /// How many more faces may be visited before hubs are skipped.
     work: u64,
 }
 
-/// A mesh of at most `target_faces` faces that follows the shape of `mesh`. It may keep more when no edge is
-/// left that can go without turning a face over, and gives back a copy when there is nothing to do.
+/// A mesh of at most `target_faces` faces that follows the shape of `mesh`. It may keep more when no edge is left that can be
+/// collapsed without flipping a face, and returns a copy when there is nothing to do.
 ///
-/// Vertices at the same place are joined first and faces without area dropped. Each new vertex has the colour
-/// of the nearest old one (with a texture: the texture's colour there), normals when the mesh had them
-/// (recomputed), and no texture.
+/// First, vertices at the same place are joined and faces without area removed. Each new vertex has the colour of the nearest
+/// old one (with a texture, the texture's colour there). Normals are recomputed if the mesh had them; the texture is not kept.
 pub fn simplify(mesh: &Mesh, target_faces: usize) -> Mesh {
     if mesh.faces().len() <= target_faces {
         return mesh.clone();
     }
-    // Work in a unit box: the tolerances do not depend on the size.
+    // Scale to a unit box, so that the tolerances do not depend on the size.
     let (low, high) = mesh.bounding_box();
     let size = (high - low).amax();
     if !(size > 0.0 && size.is_finite()) {
@@ -160,7 +158,7 @@ impl Collapser {
     }
 
     fn add_quadrics(&mut self) {
-        // Each edge with how many faces it borders and one of them.
+        // Each edge with the number of its faces and one of them.
         let mut edges: HashMap<[u32; 2], (u32, usize)> = HashMap::with_capacity(self.faces.len() * 2);
         for (index, &face) in self.faces.iter().enumerate() {
             let [a, b, c] = self.corners(face);
@@ -219,7 +217,7 @@ impl Collapser {
                 best = (error, x);
             }
         }
-        // Where all is flat, short edges first.
+        // In flat regions, collapse short edges first.
         let cost = best.0 + 1e-12 * length * length;
         let stamps = [self.stamps[i as usize], self.stamps[j as usize]];
         self.heap.push(Candidate { cost, vertices: [i, j], stamps, target: best.1 });
@@ -240,7 +238,7 @@ impl Collapser {
             self.work = self.work.saturating_sub(around as u64);
             if self.may_collapse(i, j, &candidate.target) {
                 count -= self.collapse(i, j, candidate.target);
-                // Every edge that is left there is weighed again.
+                // The costs of all edges left there are computed again.
                 self.work = self.work.saturating_sub(4 * around as u64);
             }
         }
@@ -260,7 +258,7 @@ impl Collapser {
     }
 
     fn may_collapse(&self, i: u32, j: u32, target: &Vec3) -> bool {
-        // The vertices that neighbour both must be just the tips of the faces at the edge.
+        // The common neighbours of both vertices must be exactly the opposite vertices of the faces at the edge.
         let of_j = self.neighbours(j);
         let common = self.neighbours(i).iter().filter(|v| of_j.binary_search(v).is_ok()).count();
         let shared = self.around(i).filter(|&f| self.faces[f as usize].contains(&j)).count();
@@ -277,7 +275,7 @@ impl Collapser {
                 let before = normal(self.corners(face));
                 let after = normal(face.map(|v| if v == vertex { *target } else { self.points[v as usize] }));
                 let product = before.norm() * after.norm();
-                // A face without area has no side to turn.
+                // A face without area cannot be flipped.
                 if before.norm() > 0.0 && before.dot(&after) <= MIN_COSINE * product {
                     return false;
                 }
@@ -286,8 +284,8 @@ impl Collapser {
         true
     }
 
-    /// Another face of a vertex is gone. Its list is cleared of them when half of it is: a vertex of thousands of faces would be
-    /// gone through for each.
+    /// Records that a face of a vertex was removed. The vertex's list is compacted when half of its faces are gone; compacting
+    /// for every removal would be slow at a vertex with thousands of faces.
     fn forget_one(&mut self, vertex: u32) {
         let (list, gone) = (&mut self.faces_of[vertex as usize], &mut self.gone_of[vertex as usize]);
         *gone += 1;
@@ -297,7 +295,7 @@ impl Collapser {
         }
     }
 
-    /// Moves `i` to `target`, puts it in the place of `j`; gives how many faces went.
+    /// Moves `i` to `target` and replaces `j` by it; returns how many faces were removed.
     fn collapse(&mut self, i: u32, j: u32, target: Vec3) -> usize {
         let mut gone = 0;
         self.points[i as usize] = target;
@@ -403,7 +401,7 @@ mod tests {
         Mesh::new(vertices, faces).unwrap().with_colors(colors).unwrap()
     }
 
-    /// How many edges do not border exactly two faces.
+    /// Number of edges that do not border exactly two faces.
     fn open_edges(mesh: &Mesh) -> usize {
         let mut edges: HashMap<[u32; 2], u32> = HashMap::new();
         for face in mesh.faces() {
@@ -455,7 +453,7 @@ mod tests {
         assert!((small.diameter() - 2f64.sqrt()).abs() < 1e-6);
     }
 
-    /// Every third of these kinds took minutes: faces that all share three corners, or all meet in one vertex.
+    /// Such meshes once took minutes: faces that all share three corners, or all meet in one vertex.
     #[test]
     fn two_hundred_thousand_faces_at_one_place_or_around_one_vertex_take_seconds() {
         let n = 200_000u32;
@@ -468,7 +466,7 @@ mod tests {
         rim.push(Vec3::z());
         let cone = Mesh::new(rim.clone(), (0..n).map(|k| [k, (k + 1) % n, n]).collect()).unwrap();
         assert_eq!(simplify(&cone, 4000).faces().len(), 4000);
-        // The same points in an order that jumps about: long edges everywhere.
+        // The same points in a scattered order: long edges everywhere.
         let urchin = (0..n).map(|k| [k, (k * 7919 + 1) % n, n]).filter(|f| f[0] != f[1]).collect();
         simplify(&Mesh::new(rim, urchin).unwrap(), 4000);
         assert!(start.elapsed().as_secs() < 120, "{:?}", start.elapsed());

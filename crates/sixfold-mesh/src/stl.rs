@@ -1,7 +1,8 @@
 //! STL, ascii and binary.
 //!
-//! Our own reader of 50-byte records and `vertex` lines: stl_io 0.11.0 takes a binary file whose free text
-//! starts with "solid" for ascii (several CAD programs write that), and its errors name no place.
+//! We have our own reader of 50-byte records and `vertex` lines: stl_io 0.11.0 reads a binary file whose
+//! header text starts with "solid" as ascii (several CAD programs write such files), and its errors do not
+//! state the place.
 
 use std::collections::HashMap;
 
@@ -14,7 +15,7 @@ use crate::{Mesh, MeshFileError, Resources, Unit};
 const HEADER: usize = 84;
 const RECORD: usize = 50;
 
-/// Gathers triangles and gives corners at the same place the same vertex.
+/// Collects triangles and gives corners at the same place the same vertex.
 #[derive(Default)]
 struct Corners {
     parts: Parts,
@@ -25,7 +26,7 @@ struct Corners {
 impl Corners {
     fn add(&mut self, triangle: [[f32; 3]; 3]) {
         let face = triangle.map(|corner| {
-            // Adding zero makes -0 the same place as 0.
+            // Adding zero turns -0 into 0.
             *self.seen.entry(corner.map(|c| (c + 0.0).to_bits())).or_insert_with(|| {
                 self.parts.vertices.push(Vec3::from(corner.map(f64::from)) * self.scale);
                 (self.parts.vertices.len() - 1) as u32
@@ -36,11 +37,11 @@ impl Corners {
 }
 
 /// Reads an STL mesh, ascii or binary, from the bytes of a file: triangles whose corners lie at exactly the
-/// same place share vertices; coordinates times `unit`. The facets' normals are not used: the order of
-/// the corners says as much. `resources` is not used.
+/// same place share vertices; coordinates times `unit`. The facets' normals are not used: the order of the
+/// corners gives the same information. `resources` is not used.
 ///
 /// # Errors
-/// [`MeshFileError`] with the line or the triangle; `file` is the name that messages carry.
+/// [`MeshFileError`] with the line or the triangle; `file` is the name in messages.
 pub fn parse_stl(
     bytes: &[u8],
     file: &str,
@@ -170,7 +171,7 @@ mod tests {
         assert_eq!(ascii.faces(), [[0, 1, 2], [0, 2, 3]]);
         assert_eq!(ascii.vertices()[2], Vec3::new(0.001, 0.001, 0.0));
         assert_eq!(parse(&binary(&[b' '; 80])).unwrap(), ascii);
-        // Some programs start the free text of a binary file with "solid".
+        // Some programs start the header text of a binary file with "solid".
         let mut text = [b' '; 80];
         text[..5].copy_from_slice(b"solid");
         assert_eq!(parse(&binary(&text)).unwrap(), ascii);

@@ -1,4 +1,5 @@
-//! The nearest point of a surface, exactly: a tree of boxes around triangles, cut at the median of their longest side.
+//! Exact search for the nearest point of a surface: a tree of boxes around triangles, split at the median of the longest
+//! side.
 //!
 //! The nearest point of one triangle after Ericson 2005 ("Real-Time Collision Detection", section 5.1.5). A mesh without
 //! faces is searched as its vertices.
@@ -11,7 +12,7 @@ use crate::measure::triangle_area;
 /// Maximum number of triangles in a leaf.
 const LEAF: usize = 4;
 
-/// A mesh to look for nearest points in.
+/// A mesh prepared for the search of nearest points.
 #[derive(Debug)]
 pub(crate) struct Surface {
     nodes: Vec<Node>,
@@ -19,12 +20,12 @@ pub(crate) struct Surface {
     triangles: Vec<([Vec3; 3], u32)>,
 }
 
-/// A box and what is in it.
+/// A node of the tree: a box and its content.
 #[derive(Debug, Clone, Copy)]
 struct Node {
     low: Vec3,
     high: Vec3,
-    /// Of a leaf its first triangle, of an inner node its second child; the first child follows the node.
+    /// For a leaf, its first triangle; for an inner node, its second child. The first child follows the node.
     next: u32,
     /// Triangles of a leaf, 0 for an inner node.
     count: u32,
@@ -34,14 +35,14 @@ struct Node {
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct SurfacePoint {
     pub point: Vec3,
-    /// From where it was asked for, metres.
+    /// Distance from the query point, metres.
     pub distance: f64,
     /// The unit normal of its face, zero in a mesh without faces.
     pub normal: Vec3,
 }
 
 impl Surface {
-    /// The faces of a mesh that have an area, or its vertices where none has.
+    /// Prepares the faces of a mesh that have an area, or its vertices if no face has one.
     pub fn new(mesh: &Mesh) -> Surface {
         let corners = |face: usize| (mesh.triangle(face), face as u32);
         let mut triangles: Vec<_> =
@@ -76,7 +77,7 @@ impl Surface {
         self.build(right, first + middle);
     }
 
-    /// The nearest point to `p`.
+    /// The nearest surface point to `p`, metres.
     pub fn nearest(&self, p: &Vec3) -> SurfacePoint {
         let mut best = (f64::INFINITY, *p, 0);
         self.search(p, 0, &mut best);
@@ -161,7 +162,8 @@ mod tests {
     }
 
     proptest! {
-        /// No point of any triangle, on a grid of barycentric coordinates, is nearer; and the point lies where it says.
+        /// No point of any triangle, on a grid of barycentric coordinates, is nearer; and the point is at the reported
+        /// distance.
         #[test]
         fn nothing_is_nearer(seed in 0u64..10_000, count in 1usize..40) {
             let random = &mut stream(seed, 0);

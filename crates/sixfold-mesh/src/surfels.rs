@@ -1,8 +1,8 @@
-//! A surface for a model that is only points: one small disk (surfel, Pfister et al. 2000) per point, across the normal of
-//! its neighbourhood.
+//! A surface for a model that is only points: one small disk (surfel, Pfister et al. 2000) per point, perpendicular to the
+//! normal of its neighbourhood.
 //!
-//! Disks need no orientation and no topology, so thin walls and open shapes (mugs, pitchers) are no trouble; the renderer
-//! shows both sides. The surface is as rough as the points are sparse.
+//! Disks need no orientation and no topology, so thin walls and open shapes (mugs, pitchers) work; the renderer shows both
+//! sides. The sparser the points, the rougher the surface.
 
 use std::collections::HashSet;
 use std::f64::consts::TAU;
@@ -16,8 +16,8 @@ use crate::{Mesh, MeshError};
 const CORNERS: u32 = 6;
 
 impl Mesh {
-    /// A mesh of disks through this mesh's vertices; faces, colours and textures are left behind. The disks are wide
-    /// enough to close the surface: 0.8 times the distance to the sixth neighbour.
+    /// A mesh of disks through this mesh's vertices; faces, colours and textures are dropped. The disks are wide enough to
+    /// close the surface: 0.8 times the distance to the sixth neighbour.
     ///
     /// # Errors
     /// [`MeshError::Empty`] when there are fewer than four points or all lie on one line.
@@ -57,7 +57,7 @@ impl Mesh {
 /// The median distance from a point to the nearest one elsewhere.
 fn spacing(points: &[Vec3], tree: &KdTree) -> f64 {
     let extent = points.iter().fold(0f64, |m, p| m.max((p - points[0]).norm()));
-    // Points at one place would be gone through for each of them.
+    // Remove duplicates: otherwise all points at a place would be visited for each of them.
     let mut places = HashSet::with_capacity(points.len());
     let unique: Vec<Vec3> = points.iter().filter(|p| places.insert(position_key(p))).copied().collect();
     let of_unique;

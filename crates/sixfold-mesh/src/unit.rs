@@ -1,4 +1,4 @@
-//! The length unit of a mesh file: files do not say it, so readers ask for it.
+//! The length unit of a mesh file: files do not state it, so readers take it as an argument.
 
 use std::fmt;
 use std::str::FromStr;
@@ -23,11 +23,11 @@ pub enum Unit {
     Inch,
 }
 
-/// A word that is no unit.
+/// A word that is not a unit.
 #[derive(Debug, Error, Clone, PartialEq, Eq)]
 #[error("unit: found \"{found}\", expected one of m, mm, cm, in")]
 pub struct UnitError {
-    /// What was given.
+    /// The given value.
     pub found: String,
 }
 

@@ -1,4 +1,4 @@
-//! The readers and measures on real models, where they are at hand (`SIXFOLD_DATA`, or `../shared/data`
+//! The readers and measurements on real models, if they are available (`SIXFOLD_DATA`, or `../shared/data`
 //! beside the workspace).
 
 mod support;
@@ -40,7 +40,7 @@ fn bop_models_have_the_published_diameters_and_boxes() {
             let read_time = start.elapsed();
             let id = path.file_stem().unwrap().to_str().unwrap()[4..].parse::<u32>().unwrap().to_string();
             let number = |field: &str| info[&id][field].as_f64().unwrap();
-            // The boxes in HOPE's info differ from these models by up to 0.46 mm, whoever measures them.
+            // The boxes in HOPE's info differ from these models by up to 0.46 mm, with any tool.
             let tolerance = if dataset == "lmo" { 1e-3 } else { 0.5 };
             let start = Instant::now();
             let diameter = 1e3 * mesh.diameter();
@@ -107,7 +107,7 @@ fn textured_objs() {
                 continue;
             }
             count += 1;
-            // Against what its neighbours have, this one is in centimetres.
+            // Unlike its neighbours, this one is in centimetres.
             let unit = if path.to_string_lossy().contains("libero_mug") { Unit::Centimetre } else { unit };
             let start = Instant::now();
             let mesh = read(&path, unit);

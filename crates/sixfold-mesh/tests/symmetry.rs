@@ -1,4 +1,4 @@
-//! Symmetries of solids whose symmetries are known: as drawn, under any pose, with noise, with holes, with colours that break them.
+//! Symmetries of solids with known symmetries: unchanged, in any pose, with noise, with holes, and with colours that break them.
 
 use std::f64::consts::{PI, TAU};
 
@@ -8,7 +8,7 @@ use sixfold_geometry::random::{Random, normal, stream, uniform};
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_mesh::{FoundSymmetry, Mesh, SymmetryOptions, Verdict, find_symmetries, sure_symmetries};
 
-/// A symmetry that has to be found; of half turns across a continuous axis any.
+/// A symmetry that has to be found; of the half turns perpendicular to a continuous axis, any one.
 #[derive(Debug, Clone, Copy)]
 enum Truth {
     Any(Vec3),
@@ -19,7 +19,7 @@ enum Truth {
 const NO_COLOR: [u8; 3] = [200, 200, 200];
 const RED: [u8; 3] = [200, 20, 20];
 
-/// A solid between two polygons (x, y) at two heights, `top` times as large at the upper one, counter-clockwise.
+/// A solid between two polygons (x, y) at two heights, `top` times as large at the upper height; counter-clockwise.
 fn prism(polygon: &[(f64, f64)], height: f64, top: f64) -> Mesh {
     let n = polygon.len() as u32;
     let ring = |z: f64, scale: f64| polygon.iter().map(move |(x, y)| Vec3::new(x * scale, y * scale, z));
@@ -73,7 +73,7 @@ fn cup() -> Mesh {
     lathed(&[(0.0, 0.0), (r, 0.0), (r, height), (r - wall, height), (r - wall, wall), (0.0, wall)], 48)
 }
 
-/// A cup with a handle that reaches this far, on the side of x.
+/// A cup with a handle of this reach, on the side of x.
 fn mug(reach: f64) -> Mesh {
     let bar = |x: f64, z: f64, length: f64, rise: f64| {
         let at = Pose::from_translation(Vec3::new(0.04 + x, 0.0, z));
@@ -107,7 +107,7 @@ fn ball() -> Mesh {
     lathed(&profile, 48)
 }
 
-/// The faces cut until no side is longer than `length`; every corner has a vertex of its own place in the list.
+/// The faces split until no side is longer than `length`; every corner has its own vertex.
 fn cut(mesh: &Mesh, length: f64) -> Mesh {
     let mut open: Vec<[Vec3; 3]> = (0..mesh.faces().len()).map(|f| mesh.triangle(f)).collect();
     let mut vertices: Vec<Vec3> = vec![];
@@ -133,7 +133,7 @@ fn cut(mesh: &Mesh, length: f64) -> Mesh {
     Mesh::new(vertices, faces).unwrap()
 }
 
-/// With noise of a standard deviation on every vertex, metres.
+/// The mesh with noise of a standard deviation on every vertex, metres.
 fn noisy(mesh: &Mesh, deviation: f64, seed: u64) -> Mesh {
     let random = &mut stream(seed, 1);
     let fine = cut(mesh, 0.006);
@@ -142,7 +142,7 @@ fn noisy(mesh: &Mesh, deviation: f64, seed: u64) -> Mesh {
     Mesh::new(vertices, fine.faces().to_vec()).unwrap()
 }
 
-/// With vertex colours; every face has vertices of its own, so colours end where faces do.
+/// The mesh with vertex colours; every face has its own vertices, so colours change exactly at the edges of faces.
 fn painted(mesh: &Mesh, color: impl Fn(&Vec3) -> [u8; 3]) -> Mesh {
     let triangles: Vec<[Vec3; 3]> = (0..mesh.faces().len()).map(|f| mesh.triangle(f)).collect();
     let colors = triangles.iter().flat_map(|t| [color(&((t[0] + t[1] + t[2]) / 3.0)); 3]).collect();
@@ -169,7 +169,7 @@ fn degrees(a: &Vec3, b: &Vec3) -> f64 {
     a.cross(b).norm().atan2(a.dot(b).abs()).to_degrees()
 }
 
-/// How far from the right symmetries those found may be.
+/// Tolerance between found and right symmetries.
 #[derive(Debug, Clone, Copy)]
 struct Tolerance {
     degrees: f64,
@@ -178,8 +178,8 @@ struct Tolerance {
 
 const EXACT: Tolerance = Tolerance { degrees: 0.3, metres: 0.0003 };
 
-/// Compares the sure symmetries of a mesh with the right ones, about a centre that all axes run through; largest errors, degrees
-/// and metres.
+/// Compares the sure symmetries of a mesh with the right ones, about a centre through which all axes run; returns the largest
+/// errors, degrees and metres.
 fn compare(
     name: &str,
     sure: &[FoundSymmetry],
@@ -219,7 +219,7 @@ fn moved(truth: &[Truth], pose: &Pose) -> Vec<Truth> {
     truth.iter().map(moved).collect()
 }
 
-/// Half turns about `n` axes across z, the first along `start` radians.
+/// Half turns about `n` axes perpendicular to z, the first at `start` radians.
 fn across(n: u32, start: f64) -> impl Iterator<Item = Truth> {
     (0..n).map(move |i| {
         let (sin, cos) = (start + PI * f64::from(i) / f64::from(n)).sin_cos();
@@ -239,7 +239,7 @@ fn diagonals() -> (Vec<Vec3>, Vec<Vec3>) {
     (space, [plane(1.0), plane(-1.0)].concat().iter().map(Vec3::normalize).collect())
 }
 
-/// Solids about the origin with what is true of them.
+/// Solids about the origin with their true symmetries.
 fn solids() -> Vec<(&'static str, Mesh, Vec<Truth>)> {
     let z = Vec3::z();
     let axes = [Vec3::x(), Vec3::y(), z];
@@ -280,7 +280,7 @@ fn known_solids_under_any_pose() {
             let start = std::time::Instant::now();
             let all = found(&mesh.transformed(&pose), 0.0);
             let time = start.elapsed();
-            // A drawn solid that is not symmetric is not nearly so either.
+            // A solid of this list that is not symmetric is not nearly symmetric either.
             if truth.is_empty() {
                 assert!(all.is_empty(), "{name}: {all:#?}");
             }
@@ -291,7 +291,8 @@ fn known_solids_under_any_pose() {
     }
 }
 
-/// Twelve sides are nearly round, and twelve all the same; an oval cup too is nearly round, and keeps half a turn.
+/// A prism with twelve sides is nearly round but keeps its order of twelve; an oval cup is nearly round too and keeps its half
+/// turn.
 #[test]
 fn nearly_round() {
     let all = found(&prism(&regular(12, 0.04), 0.07, 0.8), 0.0);
@@ -328,7 +329,7 @@ fn noise_of_a_millimetre() {
     }
 }
 
-/// As a mesh from photographs is: no bottom, noise, one side in large triangles and the other in small ones.
+/// Like a mesh from photographs: no bottom, noise, large triangles on one side and small ones on the other.
 #[test]
 fn without_a_bottom_and_unevenly_cut() {
     let allowed = Tolerance { degrees: 2.0, metres: 0.001 };
@@ -349,7 +350,7 @@ fn without_a_bottom_and_unevenly_cut() {
     compare("open bottle", &found, &[Truth::Any(Vec3::z())], &Vec3::zeros(), allowed);
 }
 
-/// A mesh of points has symmetries by its points.
+/// A mesh without faces has the symmetries of its points.
 #[test]
 fn points_without_faces() {
     let points = cut(&cuboid(0.06, 0.08, 0.11), 0.004).vertices().to_vec();
@@ -392,7 +393,7 @@ fn colours_break_symmetries() {
     assert_eq!(sure_symmetries(&all, true).0.len(), 1);
     assert_eq!(sure_symmetries(&all, false).0.len(), 3);
 
-    // All one colour: as by shape.
+    // A single colour: the same as by shape.
     let plain = painted(&solid, |_| RED);
     assert!(found(&plain, 0.0).iter().all(|s| s.by_shape_and_color == Verdict::Sure && s.color.is_some()));
 }
@@ -400,7 +401,7 @@ fn colours_break_symmetries() {
 #[test]
 fn a_label_leaves_the_rotations_that_it_has() {
     let can = cut(&cylinder(), 0.006);
-    // Two labels on opposite sides of the can, red as far as a sixth of a turn.
+    // Two red labels on opposite sides of the can, each over a sixth of a turn.
     let labels = |count: f64| {
         painted(&can, |p| {
             let turn = p.y.atan2(p.x) / TAU * count;
@@ -412,13 +413,13 @@ fn a_label_leaves_the_rotations_that_it_has() {
     assert!(any.by_shape == Verdict::Sure && any.by_shape_and_color == Verdict::None, "{any:?}");
     let half = |s: &&FoundSymmetry| s.order == Some(2) && s.by_shape_and_color == Verdict::Sure;
     let kept: Vec<&FoundSymmetry> = all.iter().filter(half).collect();
-    // About the can's axis, and across it through the labels or between them.
+    // About the can's axis, and perpendicular to it through the labels or between them.
     assert!(kept.iter().any(|s| degrees(&s.axis, &Vec3::z()) < 0.5), "{all:#?}");
     let flip = kept.iter().find(|s| degrees(&s.axis, &Vec3::z()) > 89.0).unwrap();
     let through = degrees(&flip.axis, &Vec3::x()).min(degrees(&flip.axis, &Vec3::y()));
     assert!(through < 6.0, "{through}");
 
-    // One label: nothing about the axis, one half turn across it.
+    // One label: no symmetry about the axis, one half turn perpendicular to it.
     let all = found(&labels(1.0), 0.0);
     let with_color: Vec<&FoundSymmetry> =
         all.iter().filter(|s| s.by_shape_and_color == Verdict::Sure).collect();
@@ -437,7 +438,7 @@ fn options_out_of_range_are_refused() {
     let refused = |options: SymmetryOptions| find_symmetries(&ball(), &options).unwrap_err().to_string();
     let noise = refused(SymmetryOptions { noise: f64::NAN, ..SymmetryOptions::default() });
     assert_eq!(noise, "option noise: found NaN, expected 0 to 0.02 m");
-    // Of a ball of 10 cm.
+    // For a ball of 10 cm.
     let noise = refused(SymmetryOptions { noise: 0.003, ..SymmetryOptions::default() });
     assert_eq!(noise, "option noise: found 0.003, expected at most a fiftieth of the object's diameter");
     assert!(refused(SymmetryOptions { samples: 3, ..SymmetryOptions::default() }).contains("samples"));
@@ -447,12 +448,12 @@ fn options_out_of_range_are_refused() {
 fn meshes_without_a_shape() {
     let point = Mesh::new(vec![Vec3::x()], vec![]).unwrap();
     assert!(found(&point, 0.0).is_empty());
-    // A square sheet and a line of points are flat and straight, and symmetric all the same.
+    // A square sheet and a line of points are flat and straight, but still symmetric.
     let sheet = Mesh::new(
         vec![Vec3::zeros(), Vec3::x() * 0.1, Vec3::new(0.1, 0.1, 0.0), Vec3::y() * 0.1],
         vec![[0, 1, 2], [0, 2, 3]],
     );
-    // Only points near the border hold it within its plane.
+    // Only points near the border determine the rotation within its plane.
     let allowed = Tolerance { degrees: 1.0, metres: 0.001 };
     let found_in_sheet = sure(&found(&sheet.unwrap(), 0.0));
     let truth: Vec<Truth> = std::iter::once(Truth::Order(4, Vec3::z())).chain(across(4, 0.0)).collect();

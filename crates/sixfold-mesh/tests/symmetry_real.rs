@@ -1,5 +1,5 @@
-//! Symmetries of scanned and reconstructed objects, where they are at hand (`SIXFOLD_DATA`, or `../shared/data` beside the
-//! workspace). What is expected was seen in the pictures of `sixfold object symmetries --out`.
+//! Symmetries of scanned and reconstructed objects, if they are available (`SIXFOLD_DATA`, or `../shared/data` beside the
+//! workspace). The expected symmetries were read from the images of `sixfold object symmetries --out`.
 
 mod support;
 
@@ -51,7 +51,7 @@ fn models_of_lmo_have_the_symmetries_of_their_models_info() {
                 assert!(s.order == Some(2) && s.by_shape >= Verdict::Likely, "object {id}: {s:?}");
                 let axis = truth.rotation().axis().unwrap();
                 let angle = degrees(&s.axis, &axis);
-                // What both half turns differ by at the object's centroid.
+                // The difference of both half turns at the object's centroid.
                 let off = (truth.transform_point(&s.point) - s.point).norm() / 2.0;
                 eprintln!(
                     "object {id}: axis {angle:.2} degrees and {:.2} mm from that of the file",
@@ -65,7 +65,7 @@ fn models_of_lmo_have_the_symmetries_of_their_models_info() {
     assert_eq!(symmetric, 4);
 }
 
-/// What is true of a scanned object's shape, as seen: continuous about z, or half turns about this many axes.
+/// The symmetry of a scanned object's shape, as inspected: continuous about z, or half turns about this many axes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum Seen {
     Nothing,
@@ -111,7 +111,7 @@ fn scanned_bowls_are_round_and_mugs_are_not() {
             check(name, &found, seen);
             // A mug is not even nearly symmetric.
             assert!(seen != Seen::Nothing || found.is_empty(), "{name}: {found:#?}");
-            // Its swirls come in several sizes, and differ from one another.
+            // Its swirls have different sizes.
             let with_color = found.iter().filter(|s| s.by_shape_and_color == Verdict::Sure).count();
             match name {
                 "akita_black_bowl" => assert_eq!(with_color, 0, "{found:#?}"),
@@ -127,7 +127,7 @@ fn scanned_household_objects() {
     let Some(data) = data() else { return };
     let objects = [
         ("Banana", Seen::Nothing),
-        // Three holes in one side: half turns about its normal only.
+        // Three holes in one side: only half turns about its normal.
         ("FoamBrick", Seen::HalfTurns(1)),
         ("GelatinBox", Seen::HalfTurns(3)),
         ("MasterChefCan", Seen::Can),

@@ -2,8 +2,8 @@
 //! last depth image are written there for `benches/render_vs_open3d.py`: vertices in the camera frame (f64), faces (u32), depth (f32).
 //!
 //! A closed mesh of 20,000 triangles covering about 70,000 of 640x480 pixels; depth and object
-//! coordinates, one thread; median of 200 frames. The images are used again and again ([`Canvas`]), as a renderer of
-//! training images or of pose hypotheses does; fresh images for each frame are timed as well.
+//! coordinates, one thread; median of 200 frames. The images are reused ([`Canvas`]), as in a renderer of training images or of
+//! pose hypotheses; new images for each frame are timed as well.
 
 use std::time::Instant;
 

@@ -1,10 +1,10 @@
-//! Our own CPU renderer: one pass fills a visibility buffer (inverse depth and triangle per pixel), and
-//! everything else (depth, masks, normals, object coordinates, barycentrics, colour) is read from it.
+//! A CPU renderer: one pass fills a visibility buffer (inverse depth and triangle per pixel), and all outputs
+//! (depth, masks, normals, object coordinates, barycentrics, colour) are read from it.
 //!
 //! Pixel centres lie at whole numbers, as in `sixfold-geometry`. Coverage is decided in integers on a
 //! grid of 1/4096 pixel with the top-left fill rule, so triangles that share an edge never both cover a
-//! pixel and never leave a gap. Depth is where the pixel's ray meets the triangle's plane, not an interpolation
-//! between rounded corners. One thread or many: same bytes.
+//! pixel and never leave a gap. Depth is computed where the pixel's ray meets the triangle's plane, not
+//! interpolated between rounded corners. The result is the same for any number of threads.
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
 #![warn(unreachable_pub, unnameable_types)]

@@ -1,28 +1,28 @@
-//! What is read from the visibility buffer: barycentrics, normals, object coordinates, masks.
+//! Outputs of the visibility buffer: barycentrics, normals, object coordinates, masks.
 
 use nalgebra::Vector3;
 use sixfold_geometry::{Image, NormalImage, PointImage, Vec2, Vec3};
 
 use crate::raster::{Canvas, SceneObject, VisibilityBuffer, face_in_camera};
 
-/// What one pixel sees.
+/// The surface at one pixel.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Surface {
-    /// Number of the object in the list given to [`VisibilityBuffer::render`].
+    /// Index of the object in the list given to [`VisibilityBuffer::render`].
     pub object: u32,
-    /// Number of the face in that object's mesh.
+    /// Index of the face in that object's mesh.
     pub face: u32,
-    /// Weights of the face's three corners at the seen point (perspective-correct; they sum to 1). A face without area, or
-    /// so large that its area is not a finite number, has all the weight at its first corner.
+    /// Weights of the face's three corners at the visible point (perspective-correct; they sum to 1). A face without area, or so
+    /// large that its area is not a finite number, has all the weight at its first corner.
     pub barycentric: [f32; 3],
 }
 
-/// The axis-parallel box that normalises object coordinates: each axis runs from -1 to 1 over it.
+/// The axis-aligned box that normalises object coordinates: each axis ranges from -1 to 1 over it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct BoundingBoxScale {
     /// The point that becomes the origin, metres.
     pub centre: Vec3,
-    /// What is divided by, per axis, metres.
+    /// The divisor of each axis, metres.
     pub half_size: Vec3,
 }
 
@@ -50,7 +50,7 @@ impl BoundingBoxScale {
 
 impl VisibilityBuffer {
     /// Calls `f` with pixel number, depth-scaled point in the camera frame (metres) and surface of every
-    /// covered pixel. `objects` are those the frame was rendered from.
+    /// covered pixel. `objects` must be the rendered ones.
     pub(crate) fn for_surfaces(
         &self,
         objects: &[SceneObject<'_>],
@@ -84,8 +84,8 @@ impl VisibilityBuffer {
         out
     }
 
-    /// Unit normals in the camera frame, turned to the camera; zero where nothing is seen, or only a face so large that its
-    /// area is not a finite number. Vertex normals are interpolated where the mesh has them, otherwise each face is flat.
+    /// Unit normals in the camera frame, pointing to the camera; zero where nothing was rendered, or where a face is so large that
+    /// its area is not a finite number. Vertex normals are interpolated where the mesh has them, otherwise each face is flat.
     pub fn normals(&self, objects: &[SceneObject<'_>]) -> NormalImage {
         let mut out = Image::filled(self.width(), self.height(), [0.0f32; 3]);
         self.for_surfaces(objects, |index, point, object, face, weights, corners| {
@@ -95,14 +95,14 @@ impl VisibilityBuffer {
         out
     }
 
-    /// The point seen in its object's own frame, metres; NaN where nothing is seen.
+    /// The visible point in its object's own frame, metres; NaN where nothing was rendered.
     pub fn object_coordinates(&self, objects: &[SceneObject<'_>]) -> PointImage {
         let mut out = Canvas::new(self.width(), self.height(), [f32::NAN; 3]);
         self.object_coordinates_into(objects, &mut out);
         out.into_image()
     }
 
-    /// As [`VisibilityBuffer::object_coordinates`], into an image that is used again and again; make it with NaN as its empty pixel.
+    /// As [`VisibilityBuffer::object_coordinates`], into an image that is reused; create it with NaN as its empty pixel.
     pub fn object_coordinates_into(&self, objects: &[SceneObject<'_>], out: &mut Canvas<[f32; 3]>) {
         // object = R^T (z K^-1 (x, y, 1) - t): linear in the pixel, so no barycentrics are needed.
         let maps: Vec<_> = objects
@@ -138,7 +138,7 @@ impl VisibilityBuffer {
         }
     }
 
-    /// As [`VisibilityBuffer::object_coordinates`], normalised to -1..1 by one box per object; NaN where nothing is seen.
+    /// As [`VisibilityBuffer::object_coordinates`], normalised to -1..1 by one box per object; NaN where nothing was rendered.
     pub fn normalised_coordinates(
         &self,
         objects: &[SceneObject<'_>],
@@ -170,7 +170,7 @@ fn barycentric(p: &Vec3, c: &[Vec3; 3]) -> [f64; 3] {
     [1.0 - w1 - w2, w1, w2]
 }
 
-/// The unit normal at a point of a face, in the camera frame, turned to the camera.
+/// The unit normal at a point of a face, in the camera frame, pointing to the camera.
 pub(crate) fn surface_normal(
     object: &SceneObject<'_>,
     face: usize,
@@ -185,7 +185,7 @@ pub(crate) fn surface_normal(
     });
     let normal = smooth.or_else(|| {
         let n = (corners[1] - corners[0]).cross(&(corners[2] - corners[0]));
-        // Of a face too large for its area to be a number, NaN.
+        // NaN for a face so large that its area is not finite.
         n.try_normalize(1e-30).filter(|n| n.iter().all(|c| c.is_finite()))
     });
     match normal {

@@ -1,4 +1,4 @@
-//! An object on its own: a camera and a pose that show most of it.
+//! A portrait of a single object: a camera and a pose in which it fills the image.
 
 use sixfold_geometry::nalgebra::{Rotation3, UnitQuaternion, Vector3};
 use sixfold_geometry::{Camera, Pose, RgbImage, Vec3};
@@ -7,7 +7,7 @@ use sixfold_mesh::Mesh;
 use crate::raster::{RenderOptions, SceneObject, VisibilityBuffer};
 use crate::shade::{Light, Material, shade};
 
-/// A camera 60 degrees wide.
+/// A camera with a field of view of 60 degrees.
 pub fn portrait_camera(width: usize, height: usize) -> Camera {
     let f = width as f64 / 2.0 / 30f64.to_radians().tan();
     Camera {

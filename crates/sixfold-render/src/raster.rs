@@ -1,4 +1,4 @@
-//! The rasteriser: triangles to a visibility buffer of inverse depth and triangle number.
+//! The rasteriser: renders triangles to a visibility buffer of inverse depth and triangle index.
 //!
 //! Edge functions after Pineda (1988) in integers; depth from the plane through the triangle, for which
 //! `1/z` is linear in the pixel coordinates.
@@ -29,14 +29,14 @@ pub enum Culling {
     Back,
 }
 
-/// How to rasterise.
+/// Options of the rasteriser.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RenderOptions {
-    /// Distance of the near plane in metres; what lies nearer is cut off.
+    /// Distance of the near plane in metres; nearer parts are clipped.
     pub near: f64,
     /// Which sides are drawn.
     pub culling: Culling,
-    /// Use all of rayon's threads for one image; the result is the same either way.
+    /// Whether all of rayon's threads are used for one image; the result is the same either way.
     pub parallel: bool,
 }
 
@@ -51,12 +51,12 @@ impl Default for RenderOptions {
 pub struct SceneObject<'a> {
     /// The mesh, in its own frame, metres.
     pub mesh: &'a Mesh,
-    /// Where it is.
+    /// Its pose.
     pub camera_from_object: Pose,
 }
 
-/// The visibility buffer of one image, to be used again and again: [`VisibilityBuffer::render`] clears only what
-/// the last image covered.
+/// The visibility buffer of one image, to be reused: [`VisibilityBuffer::render`] clears only the pixels that the last image
+/// covered.
 #[derive(Debug, Clone)]
 pub struct VisibilityBuffer {
     pub(crate) camera: Camera,
@@ -64,9 +64,9 @@ pub struct VisibilityBuffer {
     height: usize,
     /// 1/z, 0 where nothing was rendered.
     inverse_depth: Vec<f32>,
-    /// Triangle number over all objects in turn, [`NOTHING`] where nothing was rendered.
+    /// Index of the triangle, counted over all objects in order; [`NOTHING`] where nothing was rendered.
     triangle: Vec<u32>,
-    /// First triangle number of each object, and the end.
+    /// Index of the first triangle of each object, and the end.
     starts: Vec<u32>,
     /// Covered columns and rows of the last image, half open.
     dirty: [usize; 4],
@@ -113,7 +113,7 @@ impl Plane {
         let e2 = sub(p[2], p[0]);
         let n = [e1[1] * e2[2] - e1[2] * e2[1], e1[2] * e2[0] - e1[0] * e2[2], e1[0] * e2[1] - e1[1] * e2[0]];
         let d = n[0] * p[0][0] + n[1] * p[0][1] + n[2] * p[0][2];
-        // Seen exactly edge-on: no pixel's ray meets the plane in one point, take the middle.
+        // The triangle is seen exactly edge-on: no pixel's ray meets the plane in one point, so use the mean.
         let scale = 1.0 / d;
         if !scale.is_finite() {
             return Plane { a: 0.0, b: 0.0, c: 0.5 * (low + high), low: low as f32, high: high as f32 };
@@ -129,8 +129,8 @@ fn sub(a: &[f64; 3], b: &[f64; 3]) -> [f64; 3] {
     [a[0] - b[0], a[1] - b[1], a[2] - b[2]]
 }
 
-/// An image that is rendered into again and again: only what the last drawing covered is cleared, and its memory stays,
-/// which for a small object in a large image is most of the cost.
+/// An image that is reused for rendering: only the pixels that the last rendering covered are cleared, and its memory is
+/// kept. For a small object in a large image, clearing and allocating would be most of the cost.
 #[derive(Debug, Clone)]
 pub struct Canvas<T> {
     image: Image<T>,
@@ -140,23 +140,23 @@ pub struct Canvas<T> {
 }
 
 impl<T: Copy> Canvas<T> {
-    /// An image in which every pixel is `empty`. [`VisibilityBuffer::depth_into`] and its like change its size to theirs.
+    /// An image in which every pixel is `empty`. [`VisibilityBuffer::depth_into`] and similar functions resize it.
     pub fn new(width: usize, height: usize, empty: T) -> Canvas<T> {
         Canvas { image: Image::filled(width, height, empty), empty, drawn: [0; 4] }
     }
 
-    /// What was drawn last.
+    /// The last rendered image.
     pub fn image(&self) -> &Image<T> {
         &self.image
     }
 
-    /// What was drawn last, as the caller's own.
+    /// The last rendered image, by value.
     pub(crate) fn into_image(self) -> Image<T> {
         self.image
     }
 
-    /// Gives the image its size and clears what the last drawing covered and the next does not; the caller writes every pixel
-    /// of `next` (`[x0, y0, x1, y1]`).
+    /// Sets the image's size and clears the pixels that the last rendering covered and the next one does not; the caller
+    /// writes every pixel of `next` (`[x0, y0, x1, y1]`).
     pub(crate) fn begin(&mut self, width: usize, height: usize, next: [usize; 4]) -> &mut [T] {
         if self.image.size() != (width, height) {
             *self = Canvas::new(width, height, self.empty);
@@ -193,7 +193,7 @@ impl VisibilityBuffer {
         }
     }
 
-    /// Makes the buffer fit another camera, keeping its memory where it can.
+    /// Adapts the buffer to another camera, keeping its memory if possible.
     pub fn set_camera(&mut self, camera: &Camera) {
         if (camera.width, camera.height) == (self.width, self.height) {
             self.camera = camera.without_distortion();
@@ -209,8 +209,8 @@ impl VisibilityBuffer {
         self.dirty = [0; 4];
     }
 
-    /// Draws the objects; what was in the buffer is gone. Where two surfaces are equally near, the
-    /// object and triangle that comes first stays.
+    /// Renders the objects and replaces the previous content. Where two surfaces are equally near, the first object and
+    /// triangle is kept.
     pub fn render(&mut self, objects: &[SceneObject<'_>], options: &RenderOptions) {
         self.clear();
         self.starts.clear();
@@ -322,7 +322,7 @@ impl VisibilityBuffer {
         &self.inverse_depth
     }
 
-    /// Object and face drawn at pixel number `index` (`y * width + x`).
+    /// Object and face rendered at pixel `index` (`y * width + x`).
     pub fn surface_at(&self, index: usize) -> Option<(usize, usize)> {
         let number = self.triangle[index];
         if number == NOTHING {
@@ -339,7 +339,7 @@ impl VisibilityBuffer {
         depth.into_image()
     }
 
-    /// As [`VisibilityBuffer::depth`], into an image that is used again and again.
+    /// As [`VisibilityBuffer::depth`], into an image that is reused.
     pub fn depth_into(&self, depth: &mut Canvas<f32>) {
         let [x0, y0, x1, y1] = self.covered();
         let pixels = depth.begin(self.width, self.height, [x0, y0, x1, y1]);
@@ -352,7 +352,7 @@ impl VisibilityBuffer {
         }
     }
 
-    /// Where object number `object` is seen.
+    /// The pixels that show object number `object`.
     pub fn mask(&self, object: usize) -> Mask {
         let mut mask = Image::filled(self.width, self.height, false);
         if object + 1 < self.starts.len() {
@@ -362,7 +362,7 @@ impl VisibilityBuffer {
         mask
     }
 
-    /// The number of the object seen at each pixel.
+    /// The index of the object at each pixel.
     pub fn instances(&self) -> Image<Option<u32>> {
         let mut instances = Image::filled(self.width, self.height, None);
         self.for_covered(|index| {
@@ -371,8 +371,8 @@ impl VisibilityBuffer {
         instances
     }
 
-    /// The tight box around what was drawn, in BOP's terms: `x, y` of the first pixel, width and height
-    /// in pixels. `None` when nothing was rendered.
+    /// The tight box around the rendered pixels, in BOP's form: `x, y` of the first pixel, width and height in pixels. `None`
+    /// when nothing was rendered.
     pub fn bounding_box(&self) -> Option<Rect> {
         let (mut x0, mut y0, mut x1, mut y1) = (usize::MAX, usize::MAX, 0, 0);
         self.for_covered(|index| {
@@ -409,7 +409,7 @@ fn to_grid(v: f64) -> i32 {
     (v * SUBPIXEL + 6_755_399_441_055_744.0).to_bits() as i32
 }
 
-/// What a band of rows is drawn from.
+/// The input for rendering a band of rows.
 struct Work<'a> {
     camera: &'a Camera,
     /// 1/fx, 1/fy.
@@ -496,14 +496,14 @@ impl Band<'_> {
             return;
         }
         if area < 0 {
-            // Counter-clockwise as seen, in an image whose y runs down: the front.
+            // Counter-clockwise as seen, in an image whose y axis points down: the front side.
             p.swap(1, 2);
         } else if culling == Culling::Back {
             return;
         }
         // Edge functions at the first pixel, biased so that an edge's own points belong to the
-        // triangle only if it is a top or a left edge; each must be >= 0 inside. From pixel to pixel they change by
-        // multiples of the grid, so their sign is that of their whole part, and only that is stepped.
+        // triangle only if it is a top or a left edge; each must be >= 0 inside. Between pixels they change by multiples of
+        // the grid, so their sign is that of their integer part, and only the integer part is stepped.
         let start = (first_x << SUBPIXEL_BITS, first_y << SUBPIXEL_BITS);
         let mut row = [0i64; 3];
         let mut step_x = [0i64; 3];
@@ -531,8 +531,8 @@ impl Band<'_> {
         );
     }
 
-    /// Four pixels at a time, without a branch for each: in a triangle of a few pixels nobody can foresee which are
-    /// inside. The last four may reach over the box, where the edge functions know that nothing is inside.
+    /// Four pixels at a time without branches: in a triangle of a few pixels, branches would be unpredictable. The last four
+    /// may extend beyond the box, where the edge functions report that nothing is inside.
     #[inline]
     fn fill_small(&mut self, rows: &Rows, mut row: [i32; 3], step_x: [i32; 3], step_y: [i32; 3]) {
         let (low, high, a) = (rows.plane.low, rows.plane.high, rows.plane.a as f32);
@@ -547,7 +547,7 @@ impl Band<'_> {
             for (depths, numbers) in depths.iter_mut().zip(numbers) {
                 let sign: [i32; 4] = std::array::from_fn(|l| e[0][l] | e[1][l] | e[2][l]);
                 if sign[0] & sign[1] & sign[2] & sign[3] >= 0 {
-                    // Whole arrays in, whole arrays out: this is what the compiler turns into vector code.
+                    // Whole arrays in and out, so that the compiler vectorises this.
                     let (old, old_number) = (*depths, *numbers);
                     let inverse: [f32; 4] = std::array::from_fn(|l| a * x[l] + base);
                     let inverse = inverse.map(|v| if v > low { v } else { low });
@@ -604,7 +604,7 @@ impl Band<'_> {
     }
 }
 
-/// The box of a triangle in pixels, both ends within, and what is written.
+/// The box of a triangle in pixels, both ends inclusive, and the output.
 struct Rows {
     first_x: i32,
     first_y: i32,
@@ -615,7 +615,7 @@ struct Rows {
 }
 
 impl Rows {
-    /// Where row `y` starts in a band that starts at `y0`, and 1/z there.
+    /// The index at which row `y` starts in a band that starts at `y0`, and 1/z there.
     #[inline]
     fn row(&self, y: i32, y0: i32, width: usize) -> (usize, f32) {
         let base = self.plane.a * f64::from(self.first_x) + self.plane.b * f64::from(y) + self.plane.c;
@@ -636,9 +636,9 @@ fn edge(a: (i32, i32), b: (i32, i32), p: (i32, i32)) -> i64 {
     dx * (i64::from(p.1) - i64::from(a.1)) - dy * (i64::from(p.0) - i64::from(a.0))
 }
 
-/// Cuts a triangle at the near plane and at the guard band (Sutherland and Hodgman 1974).
+/// Clips a triangle at the near plane and at the guard band (Sutherland and Hodgman 1974).
 fn clip_triangle(camera: &Camera, near: f64, c: [&Corner; 3], number: u32, out: &mut Vec<ClippedTriangle>) {
-    // Signed distances, inside >= 0; the guard planes are pulled in a little so that rounding cannot leave it.
+    // Signed distances, inside >= 0; the guard planes are moved in a little so that rounding cannot leave the guard band.
     let limit = 0.999 * GUARD;
     type Distance<'a> = &'a dyn Fn(&[f64; 3]) -> f64;
     let planes: [Distance<'_>; 5] = [
@@ -684,7 +684,7 @@ fn clip_triangle(camera: &Camera, near: f64, c: [&Corner; 3], number: u32, out: 
     }
 }
 
-/// Depth in metres of one mesh at one pose, 0 where it is not seen: the short form of [`VisibilityBuffer`].
+/// Depth in metres of one mesh at one pose, 0 where nothing was rendered: a shorthand for [`VisibilityBuffer`].
 pub fn render_depth(mesh: &Mesh, camera_from_object: &Pose, camera: &Camera) -> DepthImage {
     let mut frame = VisibilityBuffer::new(camera);
     let object = SceneObject { mesh, camera_from_object: *camera_from_object };

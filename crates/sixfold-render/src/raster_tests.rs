@@ -43,7 +43,8 @@ fn sphere() -> Mesh {
     Mesh::new(vertices, faces).unwrap()
 }
 
-/// The nearest hit of the pixel's ray by Moeller and Trumbore, with a margin that tells hits near an edge.
+/// The nearest hit of the pixel's ray by Moeller and Trumbore, with a margin that identifies hits near an
+/// edge.
 fn ray_cast(mesh: &Mesh, x: f64, y: f64) -> (Option<f64>, f64) {
     let direction = camera().unproject(&Vec2::new(x, y), 1.0);
     let mut best: Option<f64> = None;
@@ -92,7 +93,7 @@ fn depth_is_that_of_a_ray_caster() {
 
 #[test]
 fn a_shared_edge_is_covered_exactly_once() {
-    // A square cut into two triangles whose common edge and outline pass exactly through pixel centres.
+    // A square of two triangles whose common edge and outline pass exactly through pixel centres.
     let z = 1.0;
     let at = |x: f64, y: f64| [(x - 31.5) / 100.0 * z, (y - 23.5) / 100.0 * z, z];
     let corners = [at(10.0, 10.0), at(20.0, 10.0), at(20.0, 20.0), at(10.0, 20.0)];
@@ -220,7 +221,7 @@ proptest! {
     fn a_random_fan_covers_its_polygon_without_gaps_or_overlaps(
         cx in 5.0..58.0f64, cy in 5.0..42.0f64, radius in 2.0..30.0f64, corners in 3usize..12, phase in 0.0..6.0f64
     ) {
-        // Each triangle alone: the sum of their pixels is the pixels of all together.
+        // Each triangle is rendered alone: their pixels add up to those of all together.
         let at = |x: f64, y: f64| [(x - 31.5) / 100.0, (y - 23.5) / 100.0, 1.0];
         let mut vertices = vec![at(cx, cy)];
         for k in 0..corners {

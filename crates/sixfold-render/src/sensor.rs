@@ -1,9 +1,9 @@
-//! A depth camera's noise on rendered depth: what an ideal depth image lacks.
+//! Simulated noise of a depth camera on ideal rendered depth.
 //!
-//! Axial and lateral noise after Nguyen, Izadi and Lovell (2012), *Modeling Kinect sensor noise for improved 3D
-//! reconstruction and tracking*; disparity quantisation and the loss at grazing angles after Khoshelham and
-//! Elberink (2012) and Handa et al. (2014); the shadow of the projector is in `shadow.rs` (dissertation, section
-//! 5.2.1: a camera and an emitter a baseline apart).
+//! Axial and lateral noise follow Nguyen, Izadi and Lovell (2012), *Modeling Kinect sensor noise for improved 3D reconstruction
+//! and tracking*; disparity quantisation and the loss at grazing angles follow Khoshelham and Elberink (2012) and Handa et al.
+//! (2014); the shadow of the projector is in `shadow.rs` (dissertation, section 5.2.1: a camera and an emitter a baseline
+//! apart).
 
 use std::sync::LazyLock;
 
@@ -31,41 +31,42 @@ pub struct DepthSensor {
     /// Growth of the lateral noise with the surface's angle `a`: this times `a / (pi/2 - a)` pixels is added (Nguyen et
     /// al. 2012, equation 2).
     pub lateral_angle: f64,
-    /// Pixels over which the axial noise is alike: a stereo camera compares windows, so its errors are waves rather than
+    /// Correlation length of the axial noise, pixels: a stereo camera compares windows, so its errors are waves rather than
     /// single pixels. 1 for independent pixels.
     pub correlation: usize,
     /// Distance between projector and camera in metres times focal length in pixels: disparity = this / depth.
     pub baseline_focal: f64,
-    /// The projector (or second camera) stands to the right of the camera and does not reach what is hidden from there.
+    /// Whether the projector's shadow is simulated: the projector (or second camera) is to the right of the camera, and surfaces
+    /// hidden from it have no depth.
     pub shadow: bool,
     /// Smallest step of the disparity in pixels; 0 for none.
     pub disparity_step: f64,
-    /// Surfaces tilted more than this from the view direction (radians) return nothing.
+    /// Surfaces tilted by more than this from the view direction (radians) have no depth.
     pub grazing_angle: f64,
-    /// Probability that a pixel on a depth edge returns nothing.
+    /// Probability that a pixel on a depth edge has no depth.
     pub edge_loss: f64,
     /// Nearest and farthest depth that is measured, metres.
     pub range: (f64, f64),
-    /// Depth steps in metres of the file written (1 mm for most cameras).
+    /// Depth resolution of the written file in metres (1 mm for most cameras).
     pub depth_step: f64,
-    /// Where normally distributed numbers come from.
+    /// The generator of normally distributed numbers.
     pub draws: Draws,
 }
 
-/// Where normally distributed numbers come from.
+/// The generator of normally distributed numbers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Draws {
-    /// Box and Muller's formula, a logarithm and two circular functions a pixel. [`DepthSensor::kinect`] keeps it, so that
-    /// what was simulated once stays the same bytes.
+    /// The Box-Muller transform, with a logarithm and two trigonometric functions per pixel. [`DepthSensor::kinect`] keeps using
+    /// it, so that its simulations stay the same to the byte.
     BoxMuller,
-    /// One of 4096 equally likely numbers: several times as fast, no number beyond 3.7 deviations.
+    /// One of 4096 equally likely quantiles: several times as fast, with no number beyond 3.7 standard deviations.
     Quantiles,
 }
 
 impl DepthSensor {
     /// A Kinect v1 / Xtion class camera: the constants of Nguyen et al. (2012), 7.5 cm baseline, 1/8 pixel
-    /// disparity steps (Khoshelham and Elberink 2012). Noise and losses of single pixels only; [`DepthSensor::xtion`] has
-    /// the projector's shadow as well.
+    /// disparity steps (Khoshelham and Elberink 2012). Only noise and losses of single pixels; [`DepthSensor::xtion`] also has
+    /// the projector's shadow.
     pub fn kinect() -> Self {
         DepthSensor {
             axial_base: 0.0012,
@@ -101,9 +102,9 @@ impl DepthSensor {
     }
 
     /// A RealSense D400 class camera (active stereo, 5 cm baseline): the error grows with the square of the distance as
-    /// `z^2 s / (f b)` with `s` = 0.08 pixels of disparity, the figure of the maker's tuning guide; the quadratic growth
-    /// is what Ahn et al. (2019), *Analysis and noise modeling of the Intel RealSense D435 for mobile robots*, measured. Its
-    /// errors are alike within the matching window; disparities have 1/32 pixel steps.
+    /// `z^2 s / (f b)` with `s` = 0.08 pixels of disparity, from the manufacturer's tuning guide; the quadratic growth was
+    /// measured by Ahn et al. (2019), *Analysis and noise modeling of the Intel RealSense D435 for mobile robots*. Its errors
+    /// are correlated within the matching window; disparities have 1/32 pixel steps.
     pub fn realsense() -> Self {
         let baseline_focal = 0.05 * 600.0;
         DepthSensor {
@@ -128,7 +129,7 @@ impl DepthSensor {
 
 /// Depth as `sensor` would measure it, from ideal `depth` (metres) and the normals of the same image.
 ///
-/// The same seed gives the same bytes at any number of threads: every row draws from its own stream.
+/// The same seed gives the same bytes for any number of threads: every row has its own random stream.
 ///
 /// # Panics
 /// When the two images have different sizes.
@@ -163,7 +164,7 @@ pub fn simulate_depth(
     Image::from_fn(width, height, |x, y| data[y * width + x])
 }
 
-/// What an ideal camera sees, and how it is spoiled.
+/// The ideal images and the noise to be applied.
 struct Seen<'a> {
     depth: &'a DepthImage,
     normals: &'a NormalImage,
@@ -173,11 +174,11 @@ struct Seen<'a> {
 }
 
 impl Seen<'_> {
-    /// One pixel; `wave` is its axial noise in standard deviations where neighbours share it.
+    /// Measures one pixel; `wave` is its axial noise in standard deviations if the noise is correlated.
     fn measure(&self, x: usize, y: usize, wave: Option<f64>, random: &mut impl Rng) -> f32 {
         let (depth, normals, sensor) = (self.depth, self.normals, self.sensor);
         let (width, height) = depth.size();
-        // The draws come first, so that a pixel's noise does not depend on what its neighbours show.
+        // The random numbers are drawn first, so that a pixel's noise does not depend on its neighbours' content.
         let ([nx, ny, nz], loss) = sensor.draws.pixel(random);
         let nz = wave.unwrap_or(nz);
         let lateral = match sensor.lateral_angle {
@@ -223,7 +224,7 @@ impl Seen<'_> {
 }
 
 impl Draws {
-    /// Three normally distributed numbers and one that is even in 0..1.
+    /// Three normally distributed numbers and one that is uniform in 0..1.
     fn pixel(self, random: &mut impl Rng) -> ([f64; 3], f64) {
         match self {
             Draws::BoxMuller => {
@@ -242,7 +243,8 @@ impl Draws {
 
 /// The normal distribution's quantiles at the midpoints of 4096 equal parts.
 static QUANTILES: LazyLock<Vec<f32>> = LazyLock::new(|| {
-    // The distribution function by the midpoint rule in small steps; each quantile where it passes its fraction.
+    // The distribution function by the midpoint rule in small steps; each quantile is taken where the distribution function
+    // passes its fraction.
     let (mut x, mut below) = (-8.0f64, 0.0f64);
     let step = 1e-4;
     (0..4096)
@@ -258,12 +260,12 @@ static QUANTILES: LazyLock<Vec<f32>> = LazyLock::new(|| {
         .collect()
 });
 
-/// `a / (pi/2 - a)` of the angle `a` between a surface and the view direction, at most that of 85 degrees.
+/// `a / (pi/2 - a)` of the angle `a` between a surface and the view direction, limited to the value at 85 degrees.
 fn steepness(normal: [f32; 3]) -> f64 {
     f64::from(STEEPNESS[(normal[2].abs().min(1.0) * 1024.0) as usize])
 }
 
-/// [`steepness`] by the cosine in steps of 1/1024.
+/// [`steepness`] tabulated over the cosine in steps of 1/1024.
 static STEEPNESS: LazyLock<Vec<f32>> = LazyLock::new(|| {
     (0..=1024)
         .map(|k| {
@@ -273,7 +275,7 @@ static STEEPNESS: LazyLock<Vec<f32>> = LazyLock::new(|| {
         .collect()
 });
 
-/// Noise that neighbours share: random numbers on a grid, drawn through and brought back to a deviation of one.
+/// Correlated noise: random numbers on a grid, interpolated and normalised to a standard deviation of one.
 struct Waves {
     step: usize,
     columns: usize,
@@ -281,7 +283,7 @@ struct Waves {
 }
 
 impl Waves {
-    /// Number of the random stream, apart from those of the rows.
+    /// Number of the random stream, different from those of the rows.
     const STREAM: u64 = u64::MAX;
 
     fn new(width: usize, height: usize, step: usize, seed: u64) -> Waves {
@@ -316,7 +318,7 @@ fn gaussian_pair(random: &mut impl Rng) -> (f64, f64) {
 mod tests {
     use super::*;
 
-    /// A wall at 1.2 m with a board at 0.8 m before its middle, 320x240.
+    /// A wall at 1.2 m with a board at 0.8 m in front of its centre, 320x240.
     fn scene() -> (DepthImage, NormalImage) {
         let depth = DepthImage::from_fn(320, 240, |x, _| if (120..200).contains(&x) { 0.8 } else { 1.2 });
         (depth, Image::filled(320, 240, [0.0, 0.0, -1.0]))

@@ -1,6 +1,6 @@
 //! Colour: vertex colours or texture, lit by Lambert's law with a Blinn-Phong highlight.
 //!
-//! Light is added up in linear colour and turned back to sRGB at the end.
+//! Light is summed in linear colour and converted to sRGB at the end.
 
 use sixfold_geometry::{Image, RgbImage, Vec3};
 
@@ -10,19 +10,19 @@ use crate::raster::{SceneObject, VisibilityBuffer};
 /// A light, placed in the camera frame. Colours are linear, 1 is full white.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Light {
-    /// The same from everywhere.
+    /// Uniform light from all directions.
     Ambient {
         /// Colour.
         color: [f32; 3],
     },
-    /// From infinitely far away.
+    /// Light from infinitely far away.
     Directional {
         /// Direction in which the light travels, in the camera frame; need not have length 1.
         direction: Vec3,
         /// Colour.
         color: [f32; 3],
     },
-    /// From a point, falling off with the square of the distance.
+    /// A point light, falling off with the square of the distance.
     Point {
         /// Position in the camera frame, metres.
         position: Vec3,
@@ -32,7 +32,7 @@ pub enum Light {
 }
 
 impl Light {
-    /// Soft light from everywhere and a lamp beside the camera: shows shape without hard shadows.
+    /// Soft ambient light and a lamp beside the camera, which show shape without hard shadows.
     pub fn default_set() -> Vec<Light> {
         vec![
             Light::Ambient { color: [0.35; 3] },
@@ -41,7 +41,7 @@ impl Light {
     }
 }
 
-/// How a surface reflects.
+/// Reflection of a surface.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Material {
     /// Strength of the highlight, 0 for none.
@@ -58,7 +58,7 @@ impl Default for Material {
     }
 }
 
-/// Draws the frame's objects in colour over `background` (black when `None`).
+/// Renders the frame's objects in colour over `background` (black when `None`).
 ///
 /// # Panics
 /// When `background` has another size than the frame.
@@ -141,7 +141,7 @@ fn to_srgb(c: f32) -> u8 {
     (s * 255.0).round() as u8
 }
 
-/// Bilinear, repeating, in linear colour; `v` runs up.
+/// Bilinear sampling of a repeated texture in linear colour; `v` points up.
 fn sample_texture(texture: &RgbImage, u: f32, v: f32, to_linear: &[f32; 256]) -> [f32; 3] {
     let (w, h) = texture.size();
     if w == 0 || h == 0 || !u.is_finite() || !v.is_finite() {

@@ -1,5 +1,5 @@
-//! The table under a set of posed objects: the plane that most of them touch from above. Ground truth of real
-//! scenes knows the objects but not what they stand on; simulated depth needs both.
+//! The table under a set of posed objects: the plane that most of them touch from above. Ground truth of real scenes contains
+//! the objects but not the table; simulated depth needs both.
 
 use sixfold_geometry::{Camera, DepthImage, Plane, Pose, Vec2, Vec3, sphere_directions};
 use sixfold_mesh::Mesh;
@@ -7,15 +7,14 @@ use sixfold_mesh::Mesh;
 use crate::raster::{RenderOptions, SceneObject, VisibilityBuffer};
 use crate::sensor::{DepthSensor, simulate_depth};
 
-/// Gaps larger than this say no more than that the object does not stand there, metres.
+/// Limit of the gap between an object and the plane, metres. Larger gaps count the same: the object does not stand on the plane.
 const GAP_LIMIT: f64 = 0.02;
 
-/// The plane most objects stand on, in the camera frame, its normal up (to the side of the objects). The camera is
-/// taken to be held upright (its y axis points down, within 80 degrees) and above the table.
-/// `None` when there is no object.
+/// The plane most objects stand on, in the camera frame, its normal up (to the side of the objects). The camera is assumed to be
+/// upright (its y axis points down, within 80 degrees) and above the table. `None` when there is no object.
 pub fn support_plane(objects: &[SceneObject<'_>]) -> Option<Plane> {
     let directions = sphere_directions(1500);
-    // The corners that matter: each object's extreme vertices over many directions.
+    // The relevant points: each object's extreme vertices over many directions.
     let extremes: Vec<Vec<Vec3>> = objects
         .iter()
         .map(|o| {
@@ -94,18 +93,17 @@ pub(crate) fn plane_mesh(plane: &Plane, camera: &Camera, size: f64) -> Option<Me
 /// Width of the table of [`depth_on_table`], metres.
 const TABLE: f64 = 3.0;
 
-/// The depth of objects, on a table where there is one.
+/// The depth of objects, on a table if there is one.
 pub struct DepthOnTable {
-    /// As it is.
+    /// Ideal depth, without noise.
     pub ideal: DepthImage,
-    /// As the depth camera measures it.
+    /// Depth as the depth camera measures it.
     pub measured: DepthImage,
-    /// Whether there is a table: asked for, and a plane lies under the objects.
+    /// Whether there is a table: it was requested, and there is a plane under the objects.
     pub has_table: bool,
 }
 
-/// What a depth camera sees of posed objects on the table that they stand on, if they may have one; `sensor` is its noise with a
-/// seed.
+/// Simulated depth of posed objects, on a table if requested; `sensor` is the camera's noise with a seed.
 pub fn depth_on_table(
     posed: &[(&Mesh, Pose)],
     camera: &Camera,

@@ -1,4 +1,4 @@
-//! A method on all targets of a BOP dataset, into a result CSV, image by image. A stopped run resumes.
+//! Runs a method on all targets of a BOP dataset and writes a result CSV, image by image. A stopped run can be resumed.
 
 use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet};
@@ -32,26 +32,26 @@ pub struct DatasetRun<'a> {
     pub dataset: &'a BopDataset,
     /// Its targets, one object each.
     pub targets: &'a [Target],
-    /// Where they are searched.
+    /// The regions in which they are searched.
     pub regions: &'a RegionSource,
     /// Poses of lower confidence are left out; `None` for the method's own threshold.
     pub min_confidence: Option<f64>,
-    /// Where methods keep what they derive from the dataset's models.
+    /// The cache for data that methods derive from the dataset's models.
     pub cache: &'a Cache,
-    /// What decides about the results: a run resumes with the same only.
+    /// The options on which the results depend: a run can only be resumed with the same ones.
     pub options: &'a RunOptions,
 }
 
-/// What a run says of its progress.
+/// Progress events of a run.
 pub enum DatasetEvent<'e> {
     /// An image, `scene/image`, is done, now or in an earlier run.
     Image {
-        /// Which.
+        /// Its name.
         image: String,
         /// Whether it was done in an earlier run.
         earlier: bool,
     },
-    /// Something that a user should know.
+    /// A note for the user.
     Note(String),
     /// The poses of an image, whose rows are on disk.
     Result(&'e ImageResult<'e>),
@@ -65,7 +65,7 @@ pub struct ImageResult<'e> {
     pub scene_id: u32,
     /// The image.
     pub im_id: u32,
-    /// What was found.
+    /// The objects found.
     pub found: Vec<PosedObject<'e>>,
 }
 
@@ -79,7 +79,7 @@ pub struct PosedObject<'e> {
     pub estimate: PoseEstimate,
 }
 
-/// What a run did.
+/// Summary of a run.
 #[derive(Debug, Serialize)]
 pub struct DatasetSummary {
     /// Images with targets.
@@ -88,9 +88,9 @@ pub struct DatasetSummary {
     pub targets: usize,
     /// Rows of the result file.
     pub poses: usize,
-    /// What was left out, and why.
+    /// Images and targets that were left out, with reasons.
     pub skipped: Vec<String>,
-    /// Seconds an image took on average, of those done now.
+    /// Mean seconds per image, over the images of this run.
     pub seconds_per_image: Option<f64>,
     /// The result file.
     pub results: String,
@@ -102,7 +102,7 @@ struct Known {
     prepared: Box<dyn PreparedObject>,
 }
 
-/// What a run knows of its dataset.
+/// The images and targets of a run.
 struct Work {
     infos: Option<ModelsInfo>,
     known: BTreeMap<u32, Known>,
@@ -112,9 +112,9 @@ struct Work {
 }
 
 impl DatasetRun<'_> {
-    /// Estimates all targets and appends the rows of every image to `results` at once. Stops between images when `stop` is set;
-    /// a broken image is left out and reported. One run at a time writes a file; a later one resumes it with the same options and
-    /// the same contents of the dataset's files only.
+    /// Estimates all targets and appends the rows of every image to `results` as soon as it is done. Stops between images when
+    /// `stop` is set; an invalid image is left out and reported. One run at a time writes a file; a later run can resume it only
+    /// with the same options and the same contents of the dataset's files.
     ///
     /// # Errors
     /// [`RunError`].
@@ -131,7 +131,7 @@ impl DatasetRun<'_> {
         if needs.region == Need::Required && matches!(self.regions, RegionSource::Anywhere) {
             return Err(RunError::NoRegions { method: self.estimator.name() });
         }
-        // Before anything is read: what another run writes meanwhile would be taken for this one's.
+        // Lock before anything is read; otherwise rows that another run writes meanwhile would be taken for rows of this one.
         let _lock = WriteLock::take(results)?;
         if let Some(note) = self.regions.without_match(self.targets) {
             events(DatasetEvent::Note(note))?;
@@ -161,12 +161,12 @@ impl DatasetRun<'_> {
             results: results.display().to_string(),
         };
         let done = self.images(&mut work, &mut record, &mut rows, &mut summary, stop, events);
-        // What is done is done, whatever ended the loop.
+        // Save finished images, whatever ended the loop.
         record.save()?;
         done.map(|()| summary)
     }
 
-    /// What an image's poses are computed from; an image that is no target any more has other targets.
+    /// The inputs of an image's poses. An image that is no longer a target counts as having other targets.
     fn inputs_of(&self, work: &Work, scene_id: u32, im_id: u32) -> Inputs {
         let targets = work.images.get(&(scene_id, im_id));
         match (work.scenes.get(&scene_id), targets) {
@@ -177,7 +177,7 @@ impl DatasetRun<'_> {
         }
     }
 
-    /// Estimates all images that are not done.
+    /// Estimates all images that are not done yet.
     fn images(
         &self,
         work: &mut Work,
@@ -196,7 +196,7 @@ impl DatasetRun<'_> {
                 events(DatasetEvent::Image { image, earlier: true })?;
                 continue;
             }
-            // Hashed before they are read: what changes in between makes the next run refuse, never believe.
+            // Hash the inputs before they are read: if a file changes in between, the next run refuses to resume.
             let inputs = self.inputs_of(work, scene_id, im_id);
             self.prepare(work, (scene_id, im_id), stop, events)?;
             let (scene, targets) = (&work.scenes[&scene_id], &work.images[&(scene_id, im_id)]);
@@ -210,7 +210,7 @@ impl DatasetRun<'_> {
                     let count = found.len();
                     summary.poses += count;
                     summary.seconds_per_image = Some(seconds.iter().sum::<f64>() / seconds.len() as f64);
-                    // Before the record has the image: an overlay that was not drawn when the run was killed is drawn by the next.
+                    // Before the image is recorded: if the run is killed before the overlay is drawn, the next run draws it.
                     events(DatasetEvent::Result(&ImageResult { scene, scene_id, im_id, found }))?;
                     record.finished((scene_id, im_id), count, &inputs)?;
                 }
@@ -220,7 +220,7 @@ impl DatasetRun<'_> {
         Ok(())
     }
 
-    /// Reads and prepares the models of an image's targets that are not yet.
+    /// Reads and prepares the models of an image's targets that were not prepared before.
     fn prepare(
         &self,
         work: &mut Work,
@@ -270,7 +270,7 @@ impl DatasetRun<'_> {
     ) -> Result<Vec<PosedObject<'e>>, RunError> {
         let input = self.input(scene, im_id)?;
         let min = self.min_confidence.unwrap_or(self.estimator.min_confidence().dataset);
-        // One query for the whole image: what depends on the image alone is computed for the first object.
+        // One query for the whole image: data that depends only on the image is computed for the first object.
         let mut whole = input.query(None, min);
         let mut found = vec![];
         for target in targets {
@@ -291,7 +291,7 @@ impl DatasetRun<'_> {
                 let query = input.query(Some(&region), min);
                 let estimates = match self.estimator.estimate(object.prepared.as_ref(), &query) {
                     Ok(estimates) => estimates,
-                    // One bad region costs its own target only.
+                    // A region that cannot be searched affects only its own target.
                     Err(error @ EstimatorError::Region { .. }) => {
                         let text = format!(
                             "image {}/{im_id}, object {}: {}",
@@ -313,7 +313,7 @@ impl DatasetRun<'_> {
         Ok(found)
     }
 
-    /// What the method needs of an image.
+    /// The inputs of an image that the method needs.
     fn input(&self, scene: &Scene, im_id: u32) -> Result<Input, RunError> {
         let (needs, method) = (self.estimator.needs(), self.estimator.name());
         let camera = scene.camera(im_id)?;
@@ -341,7 +341,7 @@ impl DatasetRun<'_> {
     }
 }
 
-/// An image as a method wants it.
+/// An image, prepared for a method.
 struct Input {
     camera: Camera,
     rgb: Option<RgbImage>,
@@ -365,7 +365,7 @@ pub(crate) fn check(stop: &AtomicBool) -> Result<(), RunError> {
     if stop.load(Ordering::Relaxed) { Err(RunError::Interrupted) } else { Ok(()) }
 }
 
-/// The rows of an image, all with the time that they took together.
+/// The rows of an image, all with the total time of the image.
 fn rows_of(found: &[PosedObject<'_>], (scene_id, im_id): (u32, u32), time: f64) -> Vec<Estimate> {
     let row = |p: &PosedObject<'_>| Estimate {
         time: Some(time),
@@ -374,8 +374,8 @@ fn rows_of(found: &[PosedObject<'_>], (scene_id, im_id): (u32, u32), time: f64) 
     found.iter().map(row).collect()
 }
 
-/// Opens a result file to append to, without what a run that was cut off did not finish: half a row, and rows of images that the
-/// record does not have.
+/// Opens a result file for appending. Removes what an interrupted run did not finish: an incomplete row, and rows of images that
+/// are not in the record.
 fn open_results(
     path: &Path,
     record: &mut RunRecord,
@@ -401,7 +401,7 @@ fn open_results(
     Ok(results)
 }
 
-/// Leaves the rows of finished images in a result file, as they are, and the header.
+/// Keeps only the header and the rows of finished images in a result file, unchanged.
 fn keep_finished(path: &Path, record: &RunRecord) -> std::io::Result<()> {
     let text = std::fs::read_to_string(path)?;
     let finished = |line: &&str| {

@@ -1,7 +1,7 @@
-//! A detector on all images of a dataset, into one file of COCO detections. A stopped run resumes.
+//! Runs a detector on all images of a dataset and writes one file of COCO detections. A stopped run can be resumed.
 //!
-//! The file is written whole at the end. Until then the rows are in `FILE.part`, with a record beside it as result files have it
-//! ([`RunOptions`]), both once a second at most; they go when nothing is left to do.
+//! The file is written as a whole at the end. Until then the rows are in `FILE.part`, with a record beside it as for result files
+//! ([`RunOptions`]). Both are written at most once a second and removed when the run is complete.
 
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
@@ -18,10 +18,10 @@ use crate::error::{RunError, describe};
 use crate::inputs::Inputs;
 use crate::record::{RunOptions, RunRecord};
 
-/// What a detector sees in an image, as COCO has it. Of `ids` only, where there are any.
+/// A detector's detections in an image, in COCO's form. Only those of the objects `ids`, if any are given.
 ///
 /// # Errors
-/// [`RunError::Estimator`] where the image cannot be searched.
+/// [`RunError::Estimator`] if the image cannot be searched.
 pub fn detections(
     detector: &dyn ObjectDetector,
     image: &RgbImage,
@@ -50,18 +50,18 @@ pub fn detections(
 /// A detection as JSON for programs and people.
 #[derive(Debug, Serialize)]
 pub struct FoundDetection {
-    /// Which object.
+    /// Id of the object.
     pub object_id: u32,
-    /// 0 to 1.
+    /// Confidence, 0 to 1.
     pub score: f64,
     /// x, y, width, height in pixels.
     pub bbox: [f64; 4],
-    /// Pixels of the mask.
+    /// Number of pixels of the mask.
     pub mask_pixels: Option<u64>,
 }
 
 impl FoundDetection {
-    /// `None` for a detection without a box, which a detector does not give.
+    /// `None` for a detection without a box, which detectors do not return.
     pub fn new(d: &Detection) -> Option<FoundDetection> {
         let b = d.bbox?;
         Some(FoundDetection {
@@ -73,7 +73,7 @@ impl FoundDetection {
     }
 }
 
-/// A detector and the images that it is to look at.
+/// A detector and the images to search.
 pub struct DetectionRun<'a> {
     /// The detector.
     pub detector: &'a dyn ObjectDetector,
@@ -81,15 +81,15 @@ pub struct DetectionRun<'a> {
     pub dataset: &'a BopDataset,
     /// Scene and image, ascending.
     pub images: &'a [(u32, u32)],
-    /// Detections of these objects are kept; of all where there are none.
+    /// Only detections of these objects are kept; all if empty.
     pub ids: &'a [u32],
-    /// What decides about the detections of an image: a run resumes with the same only.
+    /// The options on which detections depend: a run can only be resumed with the same ones.
     pub options: &'a RunOptions,
 }
 
-/// What a run says of its progress.
+/// Progress events of a run.
 pub enum DetectionEvent<'e> {
-    /// What was found in an image.
+    /// The detections in an image.
     Found {
         /// The scene.
         scene: &'e Scene,
@@ -97,48 +97,48 @@ pub enum DetectionEvent<'e> {
         im_id: u32,
         /// The image.
         image: &'e RgbImage,
-        /// What was found in it.
+        /// The detections in it.
         detections: &'e [Detection],
     },
     /// An image, `scene/image`, is done, now or in an earlier run.
     Image {
-        /// Which.
+        /// Its name.
         image: String,
         /// Whether it was done in an earlier run.
         earlier: bool,
     },
 }
 
-/// What a run did.
+/// Summary of a run.
 #[derive(Debug, Serialize)]
 pub struct DetectionSummary {
     /// Images that were searched.
     pub images: usize,
     /// Detections in them.
     pub detections: usize,
-    /// What was left out, and why.
+    /// Images that were left out, with reasons.
     pub skipped: Vec<String>,
-    /// Seconds an image took on average, of those done now.
+    /// Mean seconds per image, over the images of this run.
     pub seconds_per_image: Option<f64>,
     /// The file of detections.
     pub file: PathBuf,
 }
 
-/// The rows of a run that is not done, on disk with their record.
+/// The rows of an unfinished run, on disk with their record.
 struct Part {
     path: PathBuf,
     rows: DetectionRows,
     record: RunRecord,
     saved: Instant,
-    /// How long saving took.
+    /// Duration of the last save.
     cost: Duration,
 }
 
-/// Saving takes no more than one part in so many of the time: all rows are written again.
+/// Saving takes at most this fraction (one in N) of the time, because it writes all rows again.
 const SAVING: u32 = 20;
 
 impl Part {
-    /// That of `out`, without the rows of images that are not wanted or were not finished.
+    /// Opens the part of `out`, without the rows of images that are not requested or were not finished.
     fn open(out: &Path, options: &RunOptions, images: &[(u32, u32)]) -> Result<Part, RunError> {
         let mut path = out.as_os_str().to_owned();
         path.push(".part");
@@ -164,7 +164,7 @@ impl Part {
         if due { self.save() } else { Ok(()) }
     }
 
-    /// Removes both files: the rows are where they belong. Without the first, the record alone says nothing to the next run.
+    /// Removes both files once the rows are in the final file. A record without the first file is ignored by the next run.
     fn remove(self) -> Result<(), RunError> {
         if self.path.exists() {
             std::fs::remove_file(&self.path).map_err(|source| RunError::Io { path: self.path, source })?;
@@ -174,10 +174,9 @@ impl Part {
 }
 
 impl DetectionRun<'_> {
-    /// Searches all images and writes what was found to `out`, whole at the end. An image that cannot be read is left out and
-    /// reported. Stops between images when `stop` is set; a later run with the same options resumes, where the images that are
-    /// done have the same contents. After a run that left images out, the next one searches these only. One run at a time writes a
-    /// file.
+    /// Searches all images and writes the detections to `out`, as a whole at the end. An image that cannot be read is left out and
+    /// reported. Stops between images when `stop` is set; a later run with the same options resumes if the finished images are
+    /// unchanged. After a run that left images out, the next one searches only these. One run at a time writes a file.
     ///
     /// # Errors
     /// [`RunError`].
@@ -192,12 +191,12 @@ impl DetectionRun<'_> {
         let mut scene = None;
         part.record.check_images(stop, |scene_id, im_id| match self.scene(&mut scene, scene_id) {
             Ok(scene) => Inputs::of_colour(scene, im_id),
-            // That it cannot be read is said when its images are searched.
+            // If it cannot be read, this is reported when its images are searched.
             Err(_) => Inputs::default(),
         })?;
         let (mut skipped, mut seconds) = (vec![], vec![]);
         let done = self.images(&mut part, &mut skipped, &mut seconds, stop, events);
-        // What is done is done, whatever ended the loop.
+        // Save finished images, whatever ended the loop.
         part.save()?;
         done?;
         part.rows.sort_by_image();
@@ -216,7 +215,7 @@ impl DetectionRun<'_> {
         })
     }
 
-    /// Searches all images that are not done.
+    /// Searches all images that are not done yet.
     fn images(
         &self,
         part: &mut Part,
@@ -234,7 +233,7 @@ impl DetectionRun<'_> {
                 continue;
             }
             let scene = self.scene(&mut scene, scene_id)?;
-            // Hashed before it is read: what changes in between makes the next run refuse, never believe.
+            // Hash the image before it is read: if it changes in between, the next run refuses to resume.
             let inputs = Inputs::of_colour(scene, im_id);
             match self.search(scene, im_id, events) {
                 Ok((found, time)) => {
@@ -250,7 +249,7 @@ impl DetectionRun<'_> {
         Ok(())
     }
 
-    /// A scene, read unless it is the last one again.
+    /// A scene, read unless it is the same as the last one.
     fn scene<'s>(&self, last: &'s mut Option<Scene>, scene_id: u32) -> Result<&'s Scene, RunError> {
         Ok(match last.take().filter(|s| s.scene_id == scene_id) {
             Some(same) => last.insert(same),
@@ -258,7 +257,7 @@ impl DetectionRun<'_> {
         })
     }
 
-    /// What is found in an image, and in how many seconds.
+    /// The detections in an image and the seconds it took.
     fn search(
         &self,
         scene: &Scene,
@@ -286,8 +285,8 @@ mod tests {
 
     use super::*;
 
-    /// Finds one box an image, at a score that the image's colour decides; keeps the colours that it was asked about and asks to
-    /// stop after some.
+    /// A test detector: finds one box per image, with a score that depends on the image's colour; records the colours and requests
+    /// a stop after some images.
     struct Colours {
         seen: Mutex<Vec<u8>>,
         stop_after: usize,
@@ -317,7 +316,7 @@ mod tests {
         }
     }
 
-    /// Four images of two scenes; image 4 of scene 2 is grey 9, say.
+    /// Four images of two scenes; for example, image 4 of scene 2 is grey 9.
     fn dataset(root: &Path) -> Vec<(u32, u32)> {
         let camera = Camera::new(60.0, 60.0, 31.5, 23.5, 64, 48).unwrap();
         let images = [(1, 0, 40), (1, 5, 80), (2, 4, 9), (2, 7, 200)];
@@ -340,7 +339,7 @@ mod tests {
         options
     }
 
-    /// Runs until the detector asks to stop; the images that it saw.
+    /// Runs until the detector requests a stop; returns the images that it searched.
     fn run(
         root: &Path,
         images: &[(u32, u32)],
@@ -353,7 +352,7 @@ mod tests {
         (summary, std::mem::take(&mut *detector.seen.lock().unwrap()))
     }
 
-    /// The file without what a clock measured.
+    /// The file without measured times.
     fn found(root: &Path) -> String {
         let text = std::fs::read_to_string(root.join("found.json")).unwrap();
         let rows = text.lines().map(|line| line.split("\"time\"").next().unwrap().to_owned());
@@ -378,7 +377,7 @@ mod tests {
         let (ended, seen) = run(root, &images, &Colours::new(2), &options("0.1"));
         assert!(matches!(ended, Err(RunError::Interrupted)) && seen == [40, 80]);
         assert!(!root.join("found.json").exists() && !is_whole(root));
-        // Not with other options, nor with another image under a number that is done.
+        // It is not resumed with other options, nor with another image under a finished number.
         let other = run(root, &images, &Colours::new(9), &options("0.2")).0.unwrap_err().to_string();
         assert!(other.contains("threshold: 0.1, now 0.2") && other.contains("found.json.part"), "{other}");
         let image = root.join("test/000001/rgb/000005.png");
@@ -387,7 +386,7 @@ mod tests {
         let other = run(root, &images, &Colours::new(9), &options("0.1")).0.unwrap_err().to_string();
         assert!(other.contains("colour image of image 1/5") && other.contains("has changed"), "{other}");
         std::fs::write(&image, before).unwrap();
-        // Rows that the record does not have are searched again.
+        // Images whose rows are not in the record are searched again.
         let record = root.join("found.json.part.run.json");
         let text = std::fs::read_to_string(&record).unwrap();
         std::fs::write(&record, text.replace("\"rows\": 1", "\"rows\": 2")).unwrap();
@@ -411,7 +410,7 @@ mod tests {
         let summary = summary.unwrap();
         assert_eq!((summary.detections, summary.skipped.len(), seen), (3, 1, vec![40, 80, 200]));
         std::fs::write(&image, before).unwrap();
-        // Of fewer images this time: rows of the others go.
+        // With fewer images, the rows of the others are removed.
         let (summary, seen) = run(root, &images[1..], &Colours::new(9), &options("0.1"));
         assert_eq!((summary.unwrap().detections, seen), (3, vec![9]));
         assert!(is_whole(root));

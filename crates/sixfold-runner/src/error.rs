@@ -41,10 +41,10 @@ pub enum RunError {
     Lacks {
         /// What it lacks.
         what: &'static str,
-        /// Who needs it.
+        /// The part that needs it.
         user: &'static str,
     },
-    /// The method cannot do without regions.
+    /// The method needs regions.
     #[error(
         "--method {method} needs boxes: give --detector FILE.safetensors, --boxes gt or a file of COCO detections"
     )]
@@ -52,7 +52,7 @@ pub enum RunError {
         /// The method.
         method: &'static str,
     },
-    /// The result file is there, and nothing says what it was made with.
+    /// The result file exists without a record of its options.
     #[error(
         "{} exists, but {} does not say what it was made with: remove it or choose another --out",
         results.display(), record.display()
@@ -80,7 +80,7 @@ pub enum RunError {
     Io {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
     /// The caller asked to stop.
@@ -110,13 +110,13 @@ pub struct OtherOptions {
     pub record: PathBuf,
     /// The option that differs.
     pub option: String,
-    /// What it was.
+    /// Its earlier value.
     pub before: String,
-    /// What it is.
+    /// Its current value.
     pub now: String,
 }
 
-/// A result file whose rows were computed from other contents of a file than it has now.
+/// A result file whose rows were computed from an input file that has changed since.
 #[derive(Debug, Error)]
 #[error(
     "{} was made with another {input} ({}; see {}): remove both or choose another --out",
@@ -127,9 +127,9 @@ pub struct OtherInput {
     pub results: PathBuf,
     /// The record beside it.
     pub record: PathBuf,
-    /// What is another, and of which image or object.
+    /// The input that changed, with its image or object.
     pub input: String,
-    /// The file that it comes from; empty where it is gone.
+    /// The file of this input; empty if it no longer exists.
     pub file: PathBuf,
 }
 

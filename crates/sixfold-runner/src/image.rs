@@ -1,4 +1,4 @@
-//! A method on one image.
+//! Runs a method on one image.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -11,17 +11,17 @@ use sixfold_estimator::{EstimatorError, Object, PoseEstimate, PoseEstimator, Pre
 
 use crate::overruled::left_standing;
 
-/// A method and the image that it is asked about.
+/// A method and an image.
 pub struct ImageRun<'a> {
     /// The method.
     pub estimator: &'a dyn PoseEstimator,
-    /// The image, and where to look in it.
+    /// The image and the region to search.
     pub query: Query<'a>,
 }
 
-/// An object that was searched, with what was found of it.
+/// An object that was searched, with its estimates.
 pub struct FoundObject {
-    /// The object as the method knows it.
+    /// The object, prepared for the method.
     pub object: Box<dyn PreparedObject>,
     /// Its poses, best first.
     pub estimates: Vec<PoseEstimate>,
@@ -30,7 +30,7 @@ pub struct FoundObject {
 }
 
 impl ImageRun<'_> {
-    /// Searches one object. What the image says of all objects is computed for the first alone.
+    /// Searches one object. Data that depends only on the image is computed for the first object only.
     ///
     /// # Errors
     /// [`EstimatorError`], also for a query whose limits are out of their range.
@@ -42,7 +42,7 @@ impl ImageRun<'_> {
         Ok(FoundObject { object, estimates, seconds: start.elapsed().as_secs_f64() })
     }
 
-    /// Objects that were searched as programs and people read them.
+    /// The results in the form of a report for programs and people.
     pub fn report(&self, found: &[FoundObject]) -> ImageReport {
         let poses = found.iter().flat_map(|f| f.estimates.iter().map(|e| FoundPose::new(f, e))).collect();
         let missing = found.iter().filter(|f| f.estimates.is_empty());
@@ -51,8 +51,8 @@ impl ImageRun<'_> {
     }
 }
 
-/// Drops poses most of whose pixels belong to surer poses, of the same object or of another; only where methods say probabilities.
-/// How many were dropped.
+/// Removes poses most of whose pixels belong to more probable poses, of the same object or of another. Only for methods that
+/// report probabilities. Returns how many were removed.
 pub fn without_overruled(found: &mut [FoundObject]) -> usize {
     let all: Vec<&PoseEstimate> = found.iter().flat_map(|f| &f.estimates).collect();
     let standing = left_standing(&all);
@@ -63,7 +63,7 @@ pub fn without_overruled(found: &mut [FoundObject]) -> usize {
     standing.iter().filter(|stands| !**stands).count()
 }
 
-/// What makes a search of a depth image hopeless or slow, a sentence each.
+/// Properties of a depth image that make a search slow or unlikely to succeed, one sentence each.
 pub fn depth_notes(depth: &PreparedDepth, estimator: &dyn PoseEstimator) -> Vec<String> {
     let mut notes = vec![];
     let pixels = depth.depth().as_slice();
@@ -85,12 +85,12 @@ pub struct FoundPose {
     pub object: String,
     /// The pose by rows, metres.
     pub camera_from_object: [[f64; 4]; 4],
-    /// 0 to 1.
+    /// Confidence, 0 to 1.
     pub confidence: f64,
-    /// That the pose is right, where the method knows it.
+    /// Probability that the pose is right, if the method computes it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub probability: Option<f64>,
-    /// What verification by rendering says.
+    /// Score of verification by rendering.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub verification: Option<VerificationScore>,
     /// The method's own keys, and `seconds`.
@@ -119,22 +119,22 @@ impl FoundPose {
         }
     }
 
-    /// The fraction of the object that is seen, where verification says it.
+    /// The visible fraction of the object, if verification has computed it.
     pub fn visibility(&self) -> Option<f64> {
         self.verification.map(|v| v.visible_fraction())
     }
 }
 
-/// What one image holds, as JSON.
+/// The results of one image, as JSON.
 #[derive(Debug, Serialize)]
 pub struct ImageReport {
     /// All poses, object by object.
     pub poses: Vec<FoundPose>,
     /// Names of the objects that were not found.
     pub not_found: Vec<String>,
-    /// The overlay, where one was rendered.
+    /// The overlay, if one was rendered.
     pub overlay: Option<PathBuf>,
-    /// Images of the method's own, by name.
+    /// The method's own images, by name.
     #[serde(flatten)]
     pub diagnostics: BTreeMap<String, PathBuf>,
 }

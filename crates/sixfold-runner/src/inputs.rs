@@ -1,4 +1,4 @@
-//! What an image's poses or detections are computed from, by the hashes of its contents.
+//! The inputs of an image's poses or detections, as hashes of their contents.
 
 use std::collections::BTreeMap;
 use std::fmt::Debug;
@@ -11,17 +11,17 @@ use sixfold_mesh::ModelsInfo;
 
 use crate::regions::RegionSource;
 
-/// Inputs by name, each with the file that it comes from.
+/// Inputs by name, each with its file.
 #[derive(Debug, Default)]
 pub(crate) struct Inputs(BTreeMap<&'static str, (String, PathBuf)>);
 
-/// A hash as records have it.
+/// A hash in the form of the record.
 pub(crate) fn hex(hash: u64) -> String {
     format!("{hash:016x}")
 }
 
 impl Inputs {
-    /// The mesh of an object and what is known of it.
+    /// The mesh of an object with its diameter and symmetries.
     pub(crate) fn of_object(dataset: &BopDataset, id: u32, infos: Option<&ModelsInfo>) -> Inputs {
         let mut inputs = Inputs::default();
         let model = dataset.model_path(id, Models::Rendering);
@@ -31,8 +31,8 @@ impl Inputs {
         inputs
     }
 
-    /// What a method reads of an image, and what says where to look in it. A file that cannot be read counts as none: the method
-    /// will report it.
+    /// The files of an image that a method reads, and the source of its regions. A file that cannot be read counts as missing;
+    /// the method reports it.
     pub(crate) fn of_image(
         scene: &Scene,
         im_id: u32,
@@ -53,7 +53,7 @@ impl Inputs {
             inputs.file("colour image", scene.rgb_path(im_id));
         }
         let truth = matches!(regions, RegionSource::GroundTruth);
-        // Without `scene_gt_info.json` the boxes are rendered, with what hides the objects in the depth image.
+        // Without `scene_gt_info.json` the boxes are rendered, with occlusion from the depth image.
         let rendered = truth && image.is_none_or(|i| i.info.is_none());
         if needs.depth != Need::Unused || rendered {
             inputs.file("depth image", scene.depth_path(im_id));
@@ -65,14 +65,14 @@ impl Inputs {
         inputs
     }
 
-    /// What a detector reads of an image.
+    /// The files of an image that a detector reads.
     pub(crate) fn of_colour(scene: &Scene, im_id: u32) -> Inputs {
         let mut inputs = Inputs::default();
         inputs.file("colour image", scene.rgb_path(im_id));
         inputs
     }
 
-    /// Of an image that is not asked for.
+    /// The inputs of an image without targets.
     pub(crate) fn without_targets(dataset: &Path) -> Inputs {
         let mut inputs = Inputs::default();
         inputs.value("list of targets", &"none", dataset.to_owned());
@@ -85,7 +85,7 @@ impl Inputs {
         self.0.insert(name, (hash, path.unwrap_or_default()));
     }
 
-    /// A value by all digits of its numbers.
+    /// Adds a value with all digits of its numbers.
     fn value(&mut self, name: &'static str, value: &impl Debug, from: PathBuf) {
         self.0.insert(name, (hex(fnv1a(format!("{value:?}").as_bytes())), from));
     }
@@ -95,7 +95,7 @@ impl Inputs {
         self.0.iter().map(|(name, (hash, _))| ((*name).to_owned(), hash.clone())).collect()
     }
 
-    /// The first input that is another than before, and its file.
+    /// The first input that differs from before, and its file.
     pub(crate) fn difference(&self, before: &BTreeMap<String, String>) -> Option<(&'static str, PathBuf)> {
         let differs =
             |(name, (hash, _)): &(&&'static str, &(String, PathBuf))| before.get(**name) != Some(hash);

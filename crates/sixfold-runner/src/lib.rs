@@ -1,6 +1,6 @@
-//! Any [`PoseEstimator`](sixfold_estimator::PoseEstimator) on one image ([`ImageRun`]) or on all targets of a BOP dataset
-//! ([`DatasetRun`]), where regions come from the ground truth, a file of detections or a detector
-//! ([`RegionSource`]); and a detector by itself on all images of a dataset ([`DetectionRun`]).
+//! Runs any [`PoseEstimator`](sixfold_estimator::PoseEstimator) on one image ([`ImageRun`]) or on all targets of a BOP
+//! dataset ([`DatasetRun`]), with regions from the ground truth, a file of detections or a detector ([`RegionSource`]).
+//! Also runs a detector alone on all images of a dataset ([`DetectionRun`]).
 
 #![warn(unreachable_pub, unnameable_types)]
 

@@ -1,14 +1,14 @@
-//! Poses of different objects that claim the same pixels: the surer one has them.
+//! Resolves poses that cover the same pixels: the pixels belong to the more probable pose.
 
 use std::collections::HashSet;
 
 use sixfold_estimator::PoseEstimate;
 
-/// A pose of which more than this fraction belongs to surer ones is dropped.
+/// A pose is removed if more than this fraction of its pixels belongs to more probable ones.
 const MOST: f64 = 0.5;
 
-/// Which of some poses in one image are left: those most of whose pixels (`mask`) belong to surer ones, by probability, are not. Poses
-/// without a probability or a mask stay, and take nothing from others.
+/// Which of the poses in one image are kept: a pose is not, if most of its pixels (`mask`) belong to more probable poses. Poses
+/// without a probability or a mask are kept and take no pixels from others.
 pub(crate) fn left_standing(poses: &[&PoseEstimate]) -> Vec<bool> {
     let judged = |i: &usize| Some((poses[*i].probability?, poses[*i].mask.as_ref()?));
     let mut order: Vec<usize> = (0..poses.len()).filter(|i| judged(i).is_some()).collect();
@@ -45,13 +45,13 @@ mod tests {
             pose(Some(0.6), 0..100),
             pose(Some(0.9), 40..140),
             pose(Some(0.7), 130..200),
-            // More than half of it is the second one's.
+            // More than half of its pixels belong to the second pose.
             pose(Some(0.8), 50..100),
             pose(None, 40..140),
         ];
         let standing = left_standing(&poses.iter().collect::<Vec<_>>());
         assert_eq!(standing, [false, true, true, false, true]);
-        // Half of it may be a surer one's, no more.
+        // Up to half of a pose's pixels may belong to a more probable one.
         assert_eq!(left_standing(&[&poses[0], &poses[3]]), [true, true]);
         assert_eq!(left_standing(&[&poses[0]]), [true]);
     }

@@ -1,13 +1,12 @@
-//! What a result file was made with, kept beside it so that a later run resumes with the same.
+//! The record of a result file's options and inputs, stored beside it so that a later run can be resumed with the same ones.
 //!
 //! The record `FILE.run.json` holds version, method and options, for every object a hash of its model and of its entry in
-//! `models_info.json`, and for every finished image hashes of what its poses were computed from: camera, targets, the images that
-//! the method reads, ground truth where the boxes are its. Contents count, not paths. Where any of them has changed the whole run
-//! is refused and names the input: poses of the former contents and of the present ones must not stand in one file as if they
-//! belonged together.
+//! `models_info.json`, and for every finished image hashes of its inputs: camera, targets, the images that the method reads, and
+//! the ground truth if it provides the boxes. Contents are compared, not paths. If any of them has changed, the whole run is
+//! refused and the message names the input, because one file must not mix poses from old and new contents.
 //!
-//! Rows are written first and the record after them, once a second at most. Images that the record does not have, or with another
-//! number of rows, are those of a run that was cut off; they are computed again.
+//! Rows are written first and the record after them, at most once a second. Images that are missing in the record, or have another
+//! number of rows, come from an interrupted run; they are computed again.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -21,7 +20,7 @@ use crate::dataset::check;
 use crate::error::{OtherInput, OtherOptions, RunError};
 use crate::inputs::{Inputs, hex};
 
-/// The options that decide about a run's results, by name. An option that names a file counts by the file's contents too.
+/// The options on which a run's results depend, by name. For an option that names a file, the file's contents count too.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct RunOptions(pub BTreeMap<String, String>);
 
@@ -51,7 +50,7 @@ struct Record {
     version: String,
     method: String,
     options: RunOptions,
-    /// Of each object, by its number.
+    /// Hashes of each object, by its id.
     objects: BTreeMap<u32, BTreeMap<String, String>>,
     done: Vec<DoneImage>,
 }
@@ -74,11 +73,11 @@ pub(crate) struct RunRecord {
     saved: Instant,
 }
 
-/// A record that is less than this old is not written again: a run of a thousand images a minute would do little else.
+/// Minimum time between two saves of the record: otherwise a run of a thousand images a minute would mostly save.
 const SAVED_EVERY: Duration = Duration::from_secs(1);
 
 impl RunRecord {
-    /// The record of `results`: a new one, or the one that is there if it was made with the same options.
+    /// The record of `results`: a new one, or the existing one if it has the same options.
     pub(crate) fn open(results: &Path, method: &str, options: &RunOptions) -> Result<RunRecord, RunError> {
         let mut path = results.as_os_str().to_owned();
         path.push(".run.json");
@@ -114,7 +113,7 @@ impl RunRecord {
         Ok(opened(before, path))
     }
 
-    /// Takes down what an object is known by; an error where the rows that are there were made with another.
+    /// Records the inputs of an object; an error if existing rows were made with others.
     pub(crate) fn object(&mut self, id: u32, inputs: &Inputs) -> Result<(), RunError> {
         if let Some(before) = self.record.objects.get(&id) {
             return self.same(before, inputs, &format!("object {id}"));
@@ -123,7 +122,7 @@ impl RunRecord {
         Ok(())
     }
 
-    /// An error where an image that is done was done with other inputs than `now` says.
+    /// An error if the inputs of a finished image differ from those in `now`.
     pub(crate) fn check_images(
         &self,
         stop: &AtomicBool,
@@ -152,7 +151,8 @@ impl RunRecord {
         self.done.contains(&(scene_id, im_id))
     }
 
-    /// Forgets the images that have not as many rows in the result file as they were written with. `rows`: scene and image of each.
+    /// Removes the images whose number of rows in the result file differs from the recorded number. `rows`: scene and image of each
+    /// row.
     pub(crate) fn forget_unless_whole(&mut self, rows: impl Iterator<Item = (u32, u32)>) {
         let mut counts: BTreeMap<(u32, u32), usize> = BTreeMap::new();
         for image in rows {
@@ -162,7 +162,7 @@ impl RunRecord {
         self.done = self.record.done.iter().map(|d| (d.scene_id, d.im_id)).collect();
     }
 
-    /// Takes down an image with this many rows, which are on the disk.
+    /// Records an image with this many rows, which are on the disk.
     pub(crate) fn finished(
         &mut self,
         image: (u32, u32),
@@ -173,7 +173,7 @@ impl RunRecord {
         if self.is_due() { self.save() } else { Ok(()) }
     }
 
-    /// Takes down an image with this many rows, which will be on the disk before the record is saved.
+    /// Records an image with this many rows, which will be on the disk before the record is saved.
     pub(crate) fn add(&mut self, (scene_id, im_id): (u32, u32), rows: usize, inputs: &Inputs) {
         self.done.insert((scene_id, im_id));
         self.record.done.push(DoneImage { scene_id, im_id, rows, inputs: inputs.hashes() });
@@ -184,7 +184,7 @@ impl RunRecord {
         self.saved.elapsed() >= SAVED_EVERY
     }
 
-    /// Removes the record of results that have gone elsewhere.
+    /// Removes the record after the results were moved to another file.
     pub(crate) fn remove(self) -> Result<(), RunError> {
         std::fs::remove_file(&self.path).map_err(|source| RunError::Io { path: self.path, source })
     }

@@ -1,5 +1,5 @@
-//! Where in the images of a dataset targets are searched: the ground truth's boxes, detections of a file, a detector's, or
-//! anywhere.
+//! The regions in which targets of a dataset are searched: boxes of the ground truth, detections from a file or from a
+//! detector, or the whole image.
 
 use std::path::Path;
 use std::sync::{Mutex, PoisonError};
@@ -16,7 +16,7 @@ use crate::error::RunError;
 
 type LastImage = Option<((u32, u32), Vec<DetectedObject>)>;
 
-/// Where targets are searched.
+/// The source of the regions.
 pub enum RegionSource {
     /// In the whole image.
     Anywhere,
@@ -24,7 +24,7 @@ pub enum RegionSource {
     GroundTruth,
     /// In the boxes and masks of a file.
     Detections(Vec<Detection>),
-    /// In what a detector finds, with its answer for the last image.
+    /// In the detections of a detector, with its answer for the last image.
     Detector(Box<dyn ObjectDetector>, Mutex<LastImage>),
 }
 
@@ -32,7 +32,7 @@ impl RegionSource {
     /// A detector of the objects `ids`.
     ///
     /// # Errors
-    /// For an object that it does not know.
+    /// For an object that it was not trained on.
     pub fn of_detector(
         detector: Box<dyn ObjectDetector>,
         ids: impl IntoIterator<Item = u32>,
@@ -43,7 +43,7 @@ impl RegionSource {
         Ok(RegionSource::Detector(detector, Mutex::new(None)))
     }
 
-    /// The detections of a COCO file; then what was changed and what was left out of it, a sentence each.
+    /// The detections of a COCO file, and notes on what was changed or left out, one sentence each.
     ///
     /// # Errors
     /// [`RunError::Dataset`].
@@ -62,8 +62,8 @@ impl RegionSource {
         Ok((RegionSource::Detections(read.detections), changed, left_out))
     }
 
-    /// What to tell a user whose detections are of none of the targets: with other numbers of scenes, images or objects all of
-    /// them are passed over.
+    /// A note for the user if no detection belongs to a target: with wrong scene, image or object ids, all detections are
+    /// ignored.
     pub(crate) fn without_match(&self, targets: &[Target]) -> Option<String> {
         let RegionSource::Detections(all) = self else { return None };
         let is_for = |d: &Detection, t: &Target| {

@@ -4,7 +4,7 @@ use std::fmt::Write;
 
 use crate::image::ImageReport;
 
-/// The poses of one image and what was not found, a line each.
+/// The poses of one image and the objects not found, one line each.
 pub fn pose_table(report: &ImageReport) -> String {
     let judged = report.poses.iter().any(|p| p.probability.is_some());
     let certainty = if judged { "probability" } else { "confidence" };

@@ -1,8 +1,9 @@
-//! Who may ask: the token where there is one, requests from foreign pages refused, a limit in time.
+//! Access control: the token, if there is one; requests from foreign pages are refused; requests have a time limit.
 //!
-//! A browser sends whatever page it shows to this machine's own servers too. Without a token the `Host` has to be this machine's
-//! (a foreign name may point here: DNS rebinding), and a page of another origin may change nothing. A token arrives in the header
-//! `Authorization: Bearer TOKEN`, or in the cookie that `POST /v1/session` sets, for pages: neither images nor event streams send headers.
+//! Any page in a browser can send requests to servers on the same machine. Without a token, the `Host` has to be this machine's (a
+//! foreign name may resolve to it: DNS rebinding), and pages of another origin cannot change anything. A token arrives in the
+//! header `Authorization: Bearer TOKEN` or, for pages, in the cookie that `POST /v1/session` sets, since images and event streams
+//! cannot send headers.
 
 use std::net::IpAddr;
 use std::sync::Arc;
@@ -65,7 +66,7 @@ fn unknown() -> ApiError {
     )
 }
 
-/// Lets a request pass, or answers it with the reason.
+/// Passes a request on, or answers it with the reason for refusing it.
 pub(crate) async fn guard(State(app): State<Arc<App>>, request: Request, next: Next) -> Response {
     if let Err(error) = check(&app, request.method(), request.uri().path(), request.headers()) {
         return error.into_response();
@@ -95,7 +96,7 @@ fn check(app: &App, method: &Method, path: &str, headers: &HeaderMap) -> Answer<
     let host = text(headers, HOST.as_str());
     let changes = !matches!(*method, Method::GET | Method::HEAD | Method::OPTIONS);
     let origin = text(headers, ORIGIN.as_str()).and_then(|o| o.split_once("://").map(|(_, host)| host));
-    // An origin that is no address, such as `null`, is foreign too.
+    // An origin that is not an address, such as `null`, is foreign too.
     if changes && headers.contains_key(ORIGIN) && (origin.is_none() || origin != host) {
         return Err(ApiError::plain(
             StatusCode::FORBIDDEN,
@@ -117,7 +118,7 @@ fn check(app: &App, method: &Method, path: &str, headers: &HeaderMap) -> Answer<
             .with_status(StatusCode::FORBIDDEN))
         };
     };
-    // Pages hold nothing of anybody's, and ask for the token.
+    // Pages contain no user data, and they ask for the token.
     if !path.starts_with("/v1/") || matches!(path, "/v1/session" | "/v1/health") {
         return Ok(());
     }
@@ -132,7 +133,7 @@ fn text<'h>(headers: &'h HeaderMap, name: &str) -> Option<&'h str> {
     headers.get(name).and_then(|value| value.to_str().ok())
 }
 
-/// Whether `Host` names this machine, or the address that the server was told to listen on.
+/// Whether `Host` names this machine, or the address on which the server listens.
 fn is_own(host: &str, listening: IpAddr) -> bool {
     let name = match host.rsplit_once(':') {
         Some((name, port)) if port.bytes().all(|b| b.is_ascii_digit()) => name,
@@ -152,12 +153,12 @@ fn in_cookie(headers: &HeaderMap, token: &str) -> bool {
     })
 }
 
-/// A token as a cookie's value, in which some signs have a meaning.
+/// A token as a cookie's value, with special characters encoded.
 fn encoded(token: &str) -> String {
     token.bytes().map(|b| format!("{b:02x}")).collect()
 }
 
-/// Whether two texts are the same, in a time that says nothing of where they differ.
+/// Whether two texts are equal, compared in constant time.
 fn same(a: &str, b: &str) -> bool {
     let (a, b) = (a.as_bytes(), b.as_bytes());
     let different = a.iter().zip(b).fold(0, |bits, (x, y)| bits | (x ^ y));

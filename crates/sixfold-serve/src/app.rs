@@ -1,4 +1,5 @@
-//! What all requests share: the store, the queue of jobs, methods and objects that are kept warm.
+//! The state that all requests share: the store, the queue of jobs, and the methods and objects that are kept
+//! in memory.
 
 use std::sync::Arc;
 
@@ -13,7 +14,7 @@ use crate::options::ServerOptions;
 #[cfg(feature = "networks")]
 use crate::teachings::Teachings;
 
-/// Uploads that are held in memory at once, and images that are decoded at once to be checked.
+/// Maximum number of uploads held in memory at once, and of images decoded at once for checks.
 const UPLOADS: usize = 8;
 const DECODERS: usize = 2;
 
@@ -30,7 +31,7 @@ pub(crate) struct App {
     decoders: Semaphore,
 }
 
-/// What handlers are given.
+/// The state as handlers receive it.
 pub(crate) type Shared = axum::extract::State<Arc<App>>;
 
 impl App {
@@ -54,7 +55,7 @@ impl App {
         crate::tasks::run(self, work)
     }
 
-    /// Runs what computes or reads files beside the threads that answer, a few at a time.
+    /// Runs computations and file access outside the threads that answer requests, a few at a time.
     pub async fn blocking<T: Send + 'static>(
         self: &Arc<App>,
         work: impl FnOnce(&App) -> Answer<T> + Send + 'static,

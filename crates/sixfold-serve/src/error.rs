@@ -1,4 +1,4 @@
-//! What goes wrong: with a request, as JSON with the field, what was found and expected and what to do; and with the server itself.
+//! Errors: of a request, as JSON with the field, the values found and expected, and advice; and of the server itself.
 
 use std::net::SocketAddr;
 use std::path::PathBuf;
@@ -12,11 +12,11 @@ use sixfold_io::{CameraFileError, ImageFileError, LockError};
 use thiserror::Error;
 use utoipa::ToSchema;
 
-/// Why the server does not start, or ends.
+/// Why the server cannot start, or ends.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ServeError {
-    /// Whoever reaches another address than this machine's own needs to be distinguished.
+    /// Listening on an address that other machines can reach requires a token.
     #[error(
         "--host {host}: any machine of the network could use this server, and no token is set; give --token TOKEN (16 characters or \
          more: `openssl rand -hex 16` prints one) or set SIXFOLD_TOKEN, or leave --host at 127.0.0.1"
@@ -30,19 +30,19 @@ pub enum ServeError {
     Option {
         /// Its name.
         option: &'static str,
-        /// What was given.
+        /// The given value.
         found: String,
         /// What it may be.
         expected: String,
     },
-    /// Nothing can listen there.
+    /// The server cannot listen on the address.
     #[error(
         "cannot listen on {address}: {source}; another program may use this port: give another one with --port"
     )]
     Bind {
         /// The address.
         address: SocketAddr,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
     /// Two servers with the same folder.
@@ -53,7 +53,7 @@ pub enum ServeError {
     Io {
         /// The file or folder.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
     /// A method's files cannot be read.
@@ -83,11 +83,11 @@ pub(crate) struct ApiError {
     pub problem: Box<Problem>,
 }
 
-/// What handlers return.
+/// The return type of handlers.
 pub(crate) type Answer<T> = Result<T, ApiError>;
 
 impl ApiError {
-    /// A field that is not what it should be; 422 unless [`ApiError::with_status`] says otherwise.
+    /// An invalid field; status 422 unless [`ApiError::with_status`] sets another.
     pub fn field(
         field: impl Into<String>,
         found: impl Into<String>,
@@ -107,7 +107,7 @@ impl ApiError {
         ApiError { status: StatusCode::UNPROCESSABLE_ENTITY, problem: Box::new(problem) }
     }
 
-    /// A message of a library about a field; `expected` and `advice` are what such a field should be.
+    /// A message of a library about a field; `expected` and `advice` describe a valid field.
     pub fn about(
         field: &str,
         message: impl ToString,
@@ -115,7 +115,7 @@ impl ApiError {
         advice: impl Into<String>,
     ) -> ApiError {
         let message = message.to_string();
-        // Messages begin with the name that they were given for the file, which is the field's.
+        // Messages begin with the name given for the file, here the field's name.
         let found = message.strip_prefix(&format!("{field}: ")).unwrap_or(&message).to_owned();
         let problem = Problem {
             error: format!("{field}: {found}"),
@@ -127,7 +127,7 @@ impl ApiError {
         ApiError { status: StatusCode::UNPROCESSABLE_ENTITY, problem: Box::new(problem) }
     }
 
-    /// A message that is about no field.
+    /// A message that is not about a field.
     pub fn plain(status: StatusCode, error: impl Into<String>, advice: impl Into<String>) -> ApiError {
         let problem = Problem {
             error: error.into(),
@@ -139,7 +139,7 @@ impl ApiError {
         ApiError { status, problem: Box::new(problem) }
     }
 
-    /// The server's own fault: what the system said.
+    /// An internal error of the server, with the system's message.
     pub fn system(what: &str, error: impl std::fmt::Display) -> ApiError {
         ApiError::plain(
             StatusCode::INTERNAL_SERVER_ERROR,
@@ -152,7 +152,7 @@ impl ApiError {
         ApiError { status, ..self }
     }
 
-    /// Of the store: the name is a field of the request.
+    /// An error of the store; the name is a field of the request.
     pub fn of_store(field: &str, error: &StoreError) -> ApiError {
         match error {
             StoreError::Name(name) => ApiError::field(
@@ -197,7 +197,7 @@ impl ApiError {
         }
     }
 
-    /// Of an image; `field` is what it was named for messages.
+    /// An error of an image; `field` is its name in messages.
     pub fn of_image(field: &str, error: &ImageFileError) -> ApiError {
         match error {
             ImageFileError::Size { expected, found, .. } => ApiError::field(
@@ -221,7 +221,7 @@ impl ApiError {
         }
     }
 
-    /// Of a camera file.
+    /// An error of a camera file.
     pub fn of_camera(error: &CameraFileError) -> ApiError {
         ApiError::about(
             "camera",
@@ -238,7 +238,7 @@ impl IntoResponse for ApiError {
     }
 }
 
-/// What a client sent, as far as a message needs it.
+/// A client's text, shortened for a message.
 fn shortened(text: &str) -> String {
     const LONGEST: usize = 300;
     if text.chars().count() <= LONGEST {

@@ -1,6 +1,7 @@
-//! Uploads: the fields of a multipart form, each known by name, none larger than it may be.
+//! Uploads: the fields of a multipart form, with known names and limited sizes.
 //!
-//! What a client calls its files is for messages and for the format of meshes; no file of ours is ever called that.
+//! A client's file names are only used in messages and to find the format of meshes; the server never names its
+//! files after them.
 
 use std::collections::BTreeMap;
 use std::str::FromStr;
@@ -13,27 +14,27 @@ use axum::http::StatusCode;
 use crate::app::App;
 use crate::error::{Answer, ApiError};
 
-/// Most bytes of a field that is no file.
+/// Maximum bytes of a field that is not a file.
 const MAX_TEXT: usize = 64 << 10;
-/// Most fields of a form.
+/// Maximum number of fields of a form.
 const MAX_FIELDS: usize = 200;
-/// Longest name that a client may give a file, bytes: what file systems take.
+/// Longest name that a client may give a file, bytes: the limit of file systems.
 const MAX_NAME: usize = 255;
 
 /// The fields that a form may have.
 pub(crate) struct FormRule {
     /// Files, each at most once.
     pub files: &'static [&'static str],
-    /// Files that may come several times.
+    /// Files that may be sent several times.
     pub many_files: &'static [&'static str],
-    /// Texts, which may come several times.
+    /// Texts, which may be sent several times.
     pub texts: &'static [&'static str],
 }
 
 /// An uploaded file.
 #[derive(Debug, Clone)]
 pub(crate) struct UploadedFile {
-    /// What the client calls it; empty where it says nothing.
+    /// The client's name for it; empty if there is none.
     pub name: String,
     pub bytes: Bytes,
 }
@@ -46,7 +47,7 @@ pub(crate) struct Form {
 }
 
 impl Form {
-    /// Reads the form of a request. A few are read at once; the others wait.
+    /// Reads the form of a request. A few forms are read at once; the others wait.
     pub async fn read(app: &App, request: Request, rule: &FormRule) -> Answer<Form> {
         let _permit = app.uploads.acquire().await.map_err(|e| ApiError::system("uploads", e))?;
         let mut multipart = Multipart::from_request(request, &()).await.map_err(no_form)?;
@@ -122,14 +123,14 @@ impl Form {
         self.files.get(name).map_or(&[], Vec::as_slice)
     }
 
-    /// A file that has to be there.
+    /// A required file.
     pub fn needed_file(&self, name: &str, what: &str) -> Answer<&UploadedFile> {
         self.file(name).ok_or_else(|| {
             ApiError::field(name, "nothing", what, format!("send it as the file field {name} of the form"))
         })
     }
 
-    /// The one value of a text field; blanks at its ends do not count, and an empty one counts as none.
+    /// The single value of a text field, without blanks at its ends; an empty value counts as none.
     pub fn text(&self, name: &str) -> Answer<Option<&str>> {
         let values = self.texts.get(name).map_or(&[][..], Vec::as_slice);
         match values {
@@ -165,7 +166,8 @@ impl Form {
     }
 }
 
-/// A name that a client gives a file is never a path of ours, and one that looks like a path is a mistake or worse.
+/// A client's file name is never used as a path; a name that looks like a path is refused as a mistake or an
+/// attack.
 fn check_name(field: &str, name: &str) -> Answer<()> {
     let bad = name.len() > MAX_NAME
         || name.contains(['/', '\\', '\0'])

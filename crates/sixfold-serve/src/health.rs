@@ -1,4 +1,4 @@
-//! Whether the server lives, what it can do, and how much it has to do.
+//! Whether the server is running, what it can do, and how many jobs it has.
 
 use axum::Json;
 use axum::extract::State;

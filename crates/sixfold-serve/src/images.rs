@@ -1,4 +1,4 @@
-//! The images of a request with their camera: checked as they arrive, read again by the worker, never trusted in between.
+//! The images of a request with their camera: checked when they arrive, then read and checked again by the worker.
 
 use std::io::Cursor;
 use std::path::Path;
@@ -25,7 +25,7 @@ pub(crate) struct ImageBytes {
 }
 
 impl ImageBytes {
-    /// Those of a form. The camera may be given by numbers in place of a file: they become one.
+    /// The files of a form. Camera parameters given as numbers are converted to a camera file.
     pub fn of_form(form: &Form) -> Answer<ImageBytes> {
         let bytes = |name: &str| form.file(name).map(|f| f.bytes.to_vec());
         let mut camera = bytes("camera");
@@ -51,7 +51,7 @@ impl ImageBytes {
         Ok(ImageBytes { rgb: bytes("rgb"), depth: bytes("depth"), camera, mask: bytes("mask") })
     }
 
-    /// Those in a job's folder.
+    /// The files in a job's folder.
     pub fn of_folder(folder: &Path) -> Answer<ImageBytes> {
         let read = |name: &str| {
             let path = folder.join(name);
@@ -70,7 +70,7 @@ impl ImageBytes {
         })
     }
 
-    /// With their names, for a job's folder.
+    /// The files with their names in a job's folder.
     pub fn files(&self) -> Vec<(&'static str, &[u8])> {
         let all = [&self.rgb, &self.depth, &self.camera, &self.mask];
         FILES.into_iter().zip(all).filter_map(|(name, bytes)| Some((name, bytes.as_deref()?))).collect()
@@ -114,21 +114,21 @@ fn intrinsics(form: &Form) -> Answer<Option<String>> {
     }
 }
 
-/// What a request's images are, without lens distortion.
+/// The decoded images of a request, without lens distortion.
 pub(crate) struct Images {
     /// The camera with its distortion.
     pub lens: Camera,
     pub camera: Camera,
     pub rgb: Option<RgbImage>,
-    /// Metres.
+    /// Depth, metres.
     pub depth: Option<DepthImage>,
-    /// Of the raw image.
+    /// Mask in the raw image.
     pub mask: Option<Mask>,
 }
 
 impl Images {
-    /// Decodes them and holds them against each other. `depth_scale`: millimetres per unit of the depth image, in place of the camera
-    /// file's.
+    /// Decodes the images and checks that they fit each other. `depth_scale`: millimetres per unit of the depth image, instead of
+    /// the camera file's.
     pub fn decode(bytes: &ImageBytes, depth_scale: Option<f64>) -> Answer<Images> {
         let camera_name = Path::new("camera");
         let camera = bytes.camera.as_deref().ok_or_else(|| {
@@ -140,7 +140,7 @@ impl Images {
             )
         })?;
         let file = CameraFile::parse(camera, camera_name).map_err(|e| ApiError::of_camera(&e))?;
-        // By their headers alone: nothing is decoded that is not as large as it should be.
+        // From the headers alone: an image of a wrong size is not decoded.
         let size_of = |field: &str, bytes: &Option<Vec<u8>>| {
             let size = |b: &[u8]| image(field, b).size().map_err(|e| ApiError::of_image(field, &e));
             bytes.as_deref().map(size).transpose()
@@ -185,7 +185,7 @@ fn depth(bytes: &[u8], scale: Option<f64>) -> Answer<DepthImage> {
     image("depth", bytes).depth(scale / 1000.0).map_err(|e| ApiError::of_image("depth", &e))
 }
 
-/// An image that messages call by its field.
+/// An image that messages name by its field.
 fn image<'a>(field: &'a str, bytes: &'a [u8]) -> ImageFile<'a> {
     ImageFile::of_bytes(Path::new(field), bytes)
 }

@@ -1,11 +1,11 @@
-//! The server behind `sixfold serve`: web pages and an HTTP API under `/v1`, on the same functions as the command line.
+//! The server behind `sixfold serve`: web pages and an HTTP API under `/v1`, built on the same functions as the command line.
 //!
-//! One process answers on one address. A request is checked as it arrives, laid down as a job in a folder of its own, and worked on
-//! by one of a few workers, one job at a time each; what came of it stays there until it is removed, also when the process ends.
-//! Networks and prepared objects stay in memory, so that the next request for the same object costs its work alone.
+//! One process answers on one address. A request is checked when it arrives, stored as a job in its own folder, and processed by
+//! one of a few workers, each with one job at a time. The result stays in the folder until it is removed, even when the process
+//! ends. Networks and prepared objects stay in memory, so that the next request for the same object needs no preparation.
 //!
-//! No path of a request reaches the file system: jobs are named by the server, objects by the store's rule for names, and what is
-//! called something by a client is that in messages only.
+//! No path of a request reaches the file system: the server names jobs, the names of objects follow the store's rules, and a
+//! client's other names appear only in messages.
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
 

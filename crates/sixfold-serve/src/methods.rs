@@ -1,4 +1,5 @@
-//! Methods and objects that are kept in memory between requests: what a second request for the same object does not pay again.
+//! Methods and prepared objects that are kept in memory between requests, so that a second request for the same object does
+//! not prepare it again.
 
 use std::collections::HashMap;
 use std::path::PathBuf;
@@ -14,7 +15,7 @@ use utoipa::ToSchema;
 
 use crate::error::{Answer, ApiError, ServeError};
 
-/// Prepared objects that are kept at most; those used least recently go. Each takes a few to some ten MB.
+/// Maximum number of prepared objects kept; the least recently used are removed. Each takes a few to some ten MB.
 const MAX_KEPT: usize = 64;
 
 /// A method as clients name it.
@@ -35,7 +36,7 @@ pub(crate) struct MethodInfo {
 type Estimator = Arc<dyn PoseEstimator>;
 type Built = Result<Estimator, EstimatorError>;
 
-/// A method that is built when it is first asked for.
+/// A method that is built when it is first used.
 struct Method {
     name: &'static str,
     about: &'static str,
@@ -61,12 +62,12 @@ impl Method {
     }
 }
 
-/// Which state of a stored object something was derived from: a replaced object has another.
+/// The state of a stored object from which data was derived; it changes when the object is replaced.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Stamp(Option<SystemTime>, u64);
 
 impl Stamp {
-    /// Of the object that is stored now; its name is one that the store has found good.
+    /// The state of the object as stored now; the store has accepted its name before.
     fn of(store_folder: &std::path::Path, name: &str, record: &str) -> Stamp {
         let metadata = std::fs::metadata(store_folder.join(name).join("object.json"));
         Stamp(metadata.and_then(|m| m.modified()).ok(), sixfold_io::fnv1a(record.as_bytes()))
@@ -79,7 +80,7 @@ struct Kept<T> {
     value: T,
 }
 
-/// Values by key, the most recently used ones.
+/// The most recently used values by key.
 struct Recent<K, T> {
     kept: HashMap<K, Kept<T>>,
     clock: u64,
@@ -121,14 +122,14 @@ pub(crate) struct Methods {
 }
 
 impl Methods {
-    /// Those that this program has; `pix2pose` is a trained model.
+    /// The methods that this program has; `pix2pose` is a trained model.
     pub fn new(
         store: ObjectStore,
         folder: PathBuf,
         pix2pose: Option<PathBuf>,
     ) -> Result<Methods, ServeError> {
         let mut methods = with_networks::methods(pix2pose)?;
-        // After the method that asks all others, which is the default.
+        // After the method that combines all others, which is the default.
         let first = methods.len().min(1);
         methods.splice(
             first..first,
@@ -153,7 +154,7 @@ impl Methods {
         self.methods.iter().map(|m| m.name).collect()
     }
 
-    /// All methods as clients see them.
+    /// All methods in the form for clients.
     pub fn describe(&self) -> Vec<MethodInfo> {
         let describe = |method: &Method| {
             let needs = method.estimator().ok()?.needs();
@@ -199,7 +200,7 @@ impl Methods {
         Ok((object, stamp))
     }
 
-    /// A stored object as a method knows it, prepared now or before. `id`: its number in a trained model.
+    /// A stored object prepared for a method, now or earlier. `id`: its number in a trained model.
     pub fn prepared(
         &self,
         estimator: &dyn PoseEstimator,
@@ -232,7 +233,7 @@ fn word(need: sixfold_estimator::Need) -> &'static str {
     }
 }
 
-/// What a method says of a request, as a client reads it.
+/// A method's error as an answer to the client.
 pub(crate) fn of_estimator(field: &str, error: EstimatorError) -> ApiError {
     let text = sixfold_shell::describe(&anyhow::Error::new(error));
     ApiError::about(field, text, "what the method works on", "choose another method or other images")
@@ -278,7 +279,7 @@ mod with_networks {
 
     pub const ADVICE: &str = "pix2pose needs a trained model: start the server with --pix2pose FILE.safetensors; else choose one of them";
 
-    /// The methods that need a network. A model that cannot be read is an error now, not at the first request.
+    /// The methods that need a network. A model that cannot be read is an error at the start, not at the first request.
     pub fn methods(pix2pose: Option<PathBuf>) -> Result<Vec<Method>, ServeError> {
         let views = || {
             let views = ViewsEstimator::shipped().map_err(EstimatorError::method)?;

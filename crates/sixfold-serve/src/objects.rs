@@ -1,4 +1,5 @@
-//! Stored objects as clients see them: listed, rendered, their meshes, removed. They are added by a job (`tasks/object.rs`).
+//! The API of stored objects: list, render and remove them, and get their meshes. They are added by a job
+//! (`tasks/object.rs`).
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -23,13 +24,13 @@ use crate::methods::Stamp;
 
 /// Side of a thumbnail, pixels.
 const SIDE: usize = 320;
-/// The colour behind it: the pages' ground.
+/// Its background colour, that of the pages.
 const GROUND: [u8; 3] = [244, 245, 247];
 /// The fraction of a thumbnail's side that the object fills.
 const FILLED: f64 = 0.86;
-/// Thumbnails that are kept, some 30 kB each.
+/// Maximum number of thumbnails kept, some 30 kB each.
 const MAX_THUMBNAILS: usize = 500;
-/// Fewest faces that a mesh is reduced to.
+/// Minimum number of faces that a mesh is reduced to.
 const MIN_FACES: usize = 100;
 
 /// A stored object.
@@ -113,13 +114,13 @@ impl ObjectView {
     }
 }
 
-/// The last part of each path in a record: where files lie on this machine is nobody's business.
+/// The last component of each path in a record, so that clients do not learn the folders of this machine.
 fn file_name(source: &str) -> String {
     let last = |path: &str| path.rsplit(['/', '\\']).next().unwrap_or_default().to_owned();
     source.split(", ").map(last).collect::<Vec<_>>().join(", ")
 }
 
-/// The files of an object, whose name the store has found good.
+/// The files of an object, whose name the store has accepted before.
 fn files(app: &App, name: &str) -> Vec<ObjectFile> {
     let entries = std::fs::read_dir(app.options.objects.join(name)).into_iter().flatten().flatten();
     let file = |entry: std::fs::DirEntry| {
@@ -139,7 +140,7 @@ pub(crate) async fn list_objects(State(app): Shared) -> Answer<Json<ObjectList>>
     app.blocking(|app| {
         let names = app.store.names().map_err(|e| ApiError::of_store("name", &e))?;
         let view = |name: &String| match app.store.record(name) {
-            // Removed meanwhile.
+            // It was removed meanwhile.
             Err(StoreError::Unknown { .. }) => None,
             record => Some(ObjectView::of(app, name, record)),
         };
@@ -241,7 +242,7 @@ fn portrait(mesh: &Mesh) -> RgbImage {
     let turn = Rotation3::from_axis_angle(&Vector3::z_axis(), 30f64.to_radians());
     let rotation = UnitQuaternion::from_rotation_matrix(&(tilt * turn));
     let middle = rotation * ((low + high) * 0.5);
-    // So near that it just fits: each vertex says how far away it has to be.
+    // As near as possible: the vertices determine the smallest distance at which the object fits.
     let half = FILLED * 0.5 * SIDE as f64;
     let far_enough = mesh.vertices().iter().map(|v| {
         let v = rotation * v - middle;
@@ -289,7 +290,7 @@ pub(crate) struct MeshDetail {
     revision: Option<u64>,
 }
 
-/// Most faces that a request asks for, and which state.
+/// The maximum number of faces and the state that a request asks for.
 pub(crate) fn faces_of(
     detail: Result<Query<MeshDetail>, axum::extract::rejection::QueryRejection>,
 ) -> Answer<(usize, Option<u64>)> {
@@ -300,7 +301,7 @@ pub(crate) fn faces_of(
     if faces < MIN_FACES { Err(wrong(faces.to_string())) } else { Ok((faces, revision)) }
 }
 
-/// A mesh of at most about so many faces as the bytes of a PLY file in metres, with the colours of its texture.
+/// A mesh of at most about `faces` faces as the bytes of a PLY file in metres, with the colours of its texture.
 pub(crate) fn mesh_ply(mesh: &Mesh, faces: usize) -> Answer<Vec<u8>> {
     let mesh = coloured(&simplify(mesh, faces))?;
     Ok(ply_bytes(&mesh, Unit::Metre, PlyFormat::BinaryLittleEndian, None))
@@ -329,7 +330,7 @@ pub(crate) async fn object_mesh(
     Ok(([(CONTENT_TYPE, "model/ply"), (CACHE_CONTROL, "no-cache")], bytes).into_response())
 }
 
-/// A mesh whose texture has become colours of its vertices.
+/// A mesh with its texture converted to vertex colours.
 fn coloured(mesh: &Mesh) -> Answer<Mesh> {
     let (Some(texcoords), Some(texture)) = (mesh.texcoords(), mesh.texture()) else {
         return Ok(mesh.clone());

@@ -51,7 +51,7 @@ use crate::{access, health, jobs, objects, tasks};
 )]
 struct Description;
 
-/// What there is only where networks are built in.
+/// The parts of the API that need networks.
 #[cfg(feature = "networks")]
 #[derive(OpenApi)]
 #[openapi(

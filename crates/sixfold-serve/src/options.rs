@@ -1,4 +1,4 @@
-//! Where the server listens, who may use it, where it keeps things, and how much it takes.
+//! Options of the server: address, access, folders and limits.
 
 use std::net::{IpAddr, Ipv4Addr};
 use std::num::NonZeroUsize;
@@ -10,34 +10,34 @@ use crate::error::ServeError;
 /// Shortest token, characters: 64 bits in hexadecimal.
 const SHORTEST_TOKEN: usize = 16;
 
-/// How a server is run.
+/// Options of the server.
 #[derive(Debug, Clone)]
 pub struct ServerOptions {
     /// The address to listen on.
     pub host: IpAddr,
     /// The port; 0 is any free one.
     pub port: u16,
-    /// What every client has to know; needed on any address but the machine's own.
+    /// The secret that every client needs; required on any address except loopback.
     pub token: Option<String>,
     /// The folder of stored objects.
     pub objects: PathBuf,
-    /// The folder of jobs and what was uploaded for them.
+    /// The folder of jobs and their uploads.
     pub data: PathBuf,
-    /// Jobs that are worked on at once.
+    /// Number of jobs that are processed at once.
     pub workers: NonZeroUsize,
     /// A trained model that `sixfold train pix2pose` wrote: the method pix2pose, and a member of auto.
     pub pix2pose: Option<PathBuf>,
-    /// Most bytes of one request.
+    /// Maximum bytes of one request.
     pub max_upload: usize,
-    /// Most jobs that wait; further ones are refused until some are done.
+    /// Maximum number of waiting jobs; further ones are refused until some are done.
     pub max_waiting: usize,
-    /// Finished jobs that are kept; the oldest go first.
+    /// Number of finished jobs that are kept; the oldest are removed first.
     pub keep: usize,
-    /// Most connections at once.
+    /// Maximum number of connections at once.
     pub max_connections: usize,
     /// Longest time for one request to arrive and be answered; events of a job are sent as long as it runs.
     pub request_timeout: Duration,
-    /// Longest time for a job; one that takes longer is given up between two objects.
+    /// Longest time for a job; a longer one is stopped between two objects.
     pub job_timeout: Duration,
 }
 
@@ -61,7 +61,7 @@ impl ServerOptions {
         }
     }
 
-    /// Whether a server can be run like this.
+    /// Checks the options.
     ///
     /// # Errors
     /// [`ServeError::NoToken`] and [`ServeError::Option`].
@@ -82,7 +82,7 @@ impl ServerOptions {
     }
 }
 
-/// Whether a server may listen on this address with this token: only this machine's own is free of one.
+/// Checks that a server may listen on this address with this token: only loopback addresses need none.
 ///
 /// # Errors
 /// [`ServeError::NoToken`], and [`ServeError::Option`] for a token that is too short or cannot be sent in a header.
@@ -96,7 +96,7 @@ pub fn check_address(host: IpAddr, token: Option<&str>) -> Result<(), ServeError
     }
     Err(ServeError::Option {
         option: "token",
-        // The token itself is for nobody's screen.
+        // The token itself is never printed.
         found: format!("{} characters", token.chars().count()),
         expected: format!(
             "{SHORTEST_TOKEN} or more letters, digits and signs without blanks; `openssl rand -hex 16` prints one"

@@ -1,4 +1,4 @@
-//! The web pages: plain HTML, CSS and ES modules, built into the program. They ask nothing of any other machine.
+//! The web pages: plain HTML, CSS and ES modules, built into the program. They load nothing from other machines.
 
 use axum::Router;
 use axum::body::Bytes;
@@ -7,14 +7,14 @@ use axum::http::{HeaderName, HeaderValue};
 use axum::response::IntoResponse;
 use axum::routing::get;
 
-/// What a page may load: from here alone.
+/// The content security policy: pages load only from this server.
 const POLICY: &str = "default-src 'self'; img-src 'self' blob: data:; object-src 'none'; base-uri 'none'; \
                       form-action 'none'; frame-ancestors 'none'";
 
 const HTML: &str = "text/html; charset=utf-8";
 const SCRIPT: &str = "text/javascript; charset=utf-8";
 
-/// A page: where it is, what it and its link are called, its script and what it holds.
+/// A page: its path, its title (also of its link), its script and its content.
 type Page = (&'static str, &'static str, &'static str, &'static str);
 
 const PAGES: [Page; 4] = [
@@ -24,7 +24,7 @@ const PAGES: [Page; 4] = [
     ("/grasp", "Grasp", "grasp.js", include_str!("../assets/grasp.html")),
 ];
 
-/// What pages share, by the name that stands for it in double braces.
+/// Parts that pages share, with their placeholders in double braces.
 const PARTS: [(&str, &str); 3] = [
     ("inputs", include_str!("../assets/parts/inputs.html")),
     ("job", include_str!("../assets/parts/job.html")),
@@ -54,7 +54,7 @@ const ASSETS: &[(&str, &str, &[u8])] = assets! {
     "/static/vendor/three.LICENSE.txt", "text/plain; charset=utf-8", "vendor/three.LICENSE.txt";
 };
 
-/// Routes to all pages and what they load.
+/// Routes to all pages and the files that they load.
 pub(crate) fn routes<S: Clone + Send + Sync + 'static>() -> Router<S> {
     let pages = PAGES.iter().map(|page| (page.0, HTML, Bytes::from(html(page))));
     let files = ASSETS.iter().map(|&(path, kind, bytes)| (path, kind, Bytes::from_static(bytes)));

@@ -1,4 +1,4 @@
-//! The server: one address, a limited number of connections, and an end at which nothing is lost.
+//! The server: one address, a limited number of connections, and a shutdown that loses nothing.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -24,11 +24,11 @@ use crate::{access, health, jobs, objects, openapi, pages, tasks};
 
 /// Longest time for the head of a request to arrive.
 const HEAD_TIMEOUT: Duration = Duration::from_secs(15);
-/// So long the server waits at its end for answers that are being sent.
+/// How long the server waits at shutdown for answers that are being sent.
 const LAST_ANSWERS: Duration = Duration::from_secs(3);
-/// How often the caller's wish to stop is checked.
+/// Interval at which the caller's request to stop is checked.
 const POLL: Duration = Duration::from_millis(50);
-/// A pause after the system refused a connection, for lack of file descriptors say.
+/// A pause after the system refused a connection, for example for lack of file descriptors.
 const PAUSE: Duration = Duration::from_millis(100);
 
 /// A server that listens. It answers until it is stopped or dropped.
@@ -41,7 +41,7 @@ pub struct Server {
 }
 
 impl Server {
-    /// Starts listening and working on what waits in the data folder.
+    /// Starts listening, and starts processing the jobs that wait in the data folder.
     ///
     /// # Errors
     /// [`ServeError`].
@@ -54,7 +54,7 @@ impl Server {
             .enable_all()
             .build()
             .map_err(|source| ServeError::Io { path: options.data.clone(), source })?;
-        // Before anything is worked on: a second server on the same port does nothing.
+        // Before any job is processed, so that a second server on the same port does nothing.
         let listener = runtime.block_on(TcpListener::bind(wanted)).map_err(bind)?;
         let address = listener.local_addr().map_err(bind)?;
         let (number, connections) = (options.workers.get(), options.max_connections);
@@ -66,12 +66,12 @@ impl Server {
         Ok(Server { address, app, workers, runtime: Some(runtime), stop })
     }
 
-    /// Where it listens.
+    /// The address on which it listens.
     pub fn address(&self) -> SocketAddr {
         self.address
     }
 
-    /// Answers until `stop` is set, then ends: a job that is worked on waits for the next server.
+    /// Answers requests until `stop` is set, then ends: a running job waits for the next server.
     pub fn run_until(self, stop: &AtomicBool) {
         while !stop.load(Ordering::SeqCst) {
             std::thread::sleep(POLL);
@@ -82,7 +82,7 @@ impl Server {
         self.app.jobs.end();
         self.stop.notify_one();
         for worker in self.workers.drain(..) {
-            // A worker catches the panics of its jobs; what else there is concerns nobody any more.
+            // Workers catch the panics of their jobs; other failures do not matter at this point.
             let _ = worker.join();
         }
         if let Some(runtime) = self.runtime.take() {
@@ -97,7 +97,7 @@ impl Drop for Server {
     }
 }
 
-/// Accepts connections, as many at once as there may be, until it is told to stop.
+/// Accepts connections, at most `connections` at once, until it is asked to stop.
 async fn accept(listener: TcpListener, router: Router, connections: usize, stop: Arc<Notify>) {
     let slots = Arc::new(Semaphore::new(connections));
     loop {
@@ -117,11 +117,11 @@ async fn accept(listener: TcpListener, router: Router, connections: usize, stop:
 
 /// Answers the requests of one connection.
 async fn connection(stream: TcpStream, router: Router, slot: OwnedSemaphorePermit) {
-    // Small answers go at once.
+    // Send small answers immediately.
     let _ = stream.set_nodelay(true);
     let mut builder = http1::Builder::new();
     builder.timer(TokioTimer::new()).header_read_timeout(HEAD_TIMEOUT);
-    // Clients that go away in the middle of a request end with an error that is nobody's.
+    // A client that disconnects during a request causes an error that can be ignored.
     let _ = builder.serve_connection(TokioIo::new(stream), TowerToHyperService::new(router)).await;
     drop(slot);
 }

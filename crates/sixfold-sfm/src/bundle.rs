@@ -1,7 +1,7 @@
-//! Bundle adjustment (Triggs, McLauchlan, Hartley and Fitzgibbon 2000): reprojection errors of all points in all photographs made small
-//! by Levenberg-Marquardt steps with Cauchy's weights; points are eliminated first (Schur complement, section 6).
+//! Bundle adjustment (Triggs, McLauchlan, Hartley and Fitzgibbon 2000): minimises the reprojection errors of all points in all
+//! photographs by Levenberg-Marquardt steps with Cauchy's weights; points are eliminated first (Schur complement, section 6).
 //!
-//! Sums are made over parts whose bounds do not depend on the number of threads.
+//! Sums are computed over parts whose bounds do not depend on the number of threads.
 
 use rayon::prelude::*;
 use sixfold_geometry::nalgebra::{DMatrix, DVector, Matrix3, Vector6};
@@ -9,25 +9,25 @@ use sixfold_geometry::{Pose, Vec2, Vec3, stats::median};
 
 use crate::lens::Lens;
 
-/// Residuals of this many standard deviations count half.
+/// Residuals of this many standard deviations get half the weight.
 const CAUCHY: f64 = 2.0;
 /// Smallest standard deviation of a residual, pixels.
 const LEAST_DEVIATION: f64 = 1e-3;
-/// Parts of the sums.
+/// Number of parts of the sums.
 const PARTS: usize = 8;
-/// What an observation behind its camera costs, pixels.
+/// Residual of an observation behind its camera, pixels.
 const BEHIND: f64 = 1e3;
-/// The sum of costs changes by less than this fraction: done.
+/// Convergence: the sum of costs changes by less than this fraction.
 const DONE: f64 = 1e-7;
 
-/// Where a photograph shows a point.
+/// An observation of a point in a photograph.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Seen {
     pub camera: usize,
     pub pixel: Vec2,
 }
 
-/// What is adjusted.
+/// The adjusted state.
 #[derive(Debug, Clone)]
 pub(crate) struct Bundle {
     pub lens: Lens,
@@ -35,7 +35,7 @@ pub(crate) struct Bundle {
     pub points: Vec<Vec3>,
 }
 
-/// One observation, linear around the present state.
+/// One observation, linearised around the current state.
 struct Linear {
     camera: usize,
     residual: Vec2,
@@ -56,7 +56,7 @@ impl Bundle {
         Some(self.lens.project(&self.poses[seen.camera].transform_point(point))? - seen.pixel)
     }
 
-    /// The standard deviation of residuals along one axis, whatever wrong ones do, pixels.
+    /// The standard deviation of residuals along one axis, robust to wrong ones, pixels.
     pub fn deviation(&self, seen: &[Vec<Seen>]) -> f64 {
         let mut all: Vec<f64> = vec![];
         for (point, seen) in self.points.iter().zip(seen) {
@@ -110,7 +110,7 @@ fn parts(count: usize) -> Vec<std::ops::Range<usize>> {
     (0..PARTS).map(|k| count * k / PARTS..count * (k + 1) / PARTS).collect()
 }
 
-/// A point's part of the equations: the inverse of its own block, its gradient, and what couples it to the other unknowns.
+/// A point's part of the equations: the inverse of its own block, its gradient, and its coupling to the other unknowns.
 struct PointPart {
     inverse: Matrix3<f64>,
     gradient: Vec3,
@@ -135,7 +135,7 @@ impl System {
         }
     }
 
-    /// Adds the observations of a point, which is eliminated; `None` where these do not hold it.
+    /// Adds the observations of a point, which is eliminated; `None` if they do not determine the point.
     fn add(&mut self, linear: &[Linear], free: &[usize], damping: f64) -> Option<PointPart> {
         let (mut own, mut gradient) = (Matrix3::zeros(), Vec3::zeros());
         let mut couplings: Vec<(usize, Vec<Vec3>)> = vec![(0, vec![Vec3::zeros(); free.len()])];
@@ -184,8 +184,8 @@ impl System {
     }
 }
 
-/// The state with the lowest cost near a start; only the numbers `free` of the lens may change, which are believed to be near those of
-/// `guess`. The first pose stays. `seen` holds where each point is seen.
+/// The state with the lowest cost near a start; only the parameters `free` of the lens may change, with a prior around those of
+/// `guess`. The first pose is fixed. `seen` holds the observations of each point.
 pub(crate) fn adjusted(
     start: Bundle,
     seen: &[Vec<Seen>],
@@ -248,7 +248,7 @@ fn stepped(
     for a in 0..count {
         sum.matrix[(a, a)] += damping * sum.diagonal[a] + 1e-12;
     }
-    // The first pose is held.
+    // The first pose is fixed.
     for a in free.len()..(free.len() + 6).min(count) {
         sum.matrix[(a, a)] += 1e6 * (sum.diagonal[a] + 1.0);
     }
@@ -296,7 +296,7 @@ mod tests {
             .map(|i| Vec3::from_fn(|axis, _| 0.4 * (f64::from(i) * [1.3, 2.1, 3.7][axis]).sin()))
             .collect();
         let truth = Bundle { lens, poses, points };
-        // Every eighth observation is 40 pixels off, to one side.
+        // Every eighth observation is shifted by 40 pixels to one side.
         let wrong = |i: usize, k: usize| (i * 6 + k) % 8 == 3;
         let pixel =
             |i: usize, k: usize| lens.project(&truth.poses[k].transform_point(&truth.points[i])).unwrap();

@@ -1,9 +1,9 @@
-//! Why photographs cannot be put together, or one of them cannot.
+//! Why photographs, or one of them, cannot be registered.
 
 use sixfold_geometry::{CameraError, OptionError};
 use thiserror::Error;
 
-/// Why a photograph has no pose. Photographs are numbers from 0.
+/// Why a photograph has no pose. Photographs are numbered from 0.
 #[derive(Debug, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum LeftOut {
@@ -16,27 +16,27 @@ pub enum LeftOut {
     },
     /// Too few matches with any other photograph.
     FewMatches {
-        /// Most matches with another photograph that agree with one motion of the camera.
+        /// The largest number of matches with another photograph that agree with one camera motion.
         found: usize,
         /// How many are needed.
         least: usize,
     },
-    /// It matches others, but none of the largest group.
+    /// It matches other photographs, but none of the largest group.
     OtherGroup {
         /// The photographs of its group.
         group: Vec<usize>,
     },
-    /// Too few of its features agree with the points that the others see.
+    /// Too few of its features agree with the points of the other photographs.
     FewInliers {
         /// How many agree.
         found: usize,
-        /// How many should.
+        /// Number of features with known points.
         of: usize,
     },
 }
 
 impl LeftOut {
-    /// The reason in words; `name` gives what a photograph is called.
+    /// The reason in words; `name` returns the name of a photograph.
     pub fn reason(&self, name: &dyn Fn(usize) -> String) -> String {
         match self {
             LeftOut::FewFeatures { found, least } => {
@@ -61,7 +61,7 @@ impl LeftOut {
     }
 }
 
-/// Why photographs cannot be put together.
+/// Why photographs cannot be registered.
 #[derive(Debug, Clone, PartialEq, Error)]
 #[non_exhaustive]
 pub enum SfmError {
@@ -72,7 +72,7 @@ pub enum SfmError {
         found: usize,
         /// How many are needed.
         least: usize,
-        /// For each photograph, why it does not; `None` for those that match.
+        /// For each photograph, why it does not match; `None` for those that match.
         left_out: Vec<Option<LeftOut>>,
     },
     /// The camera only rotated.
@@ -93,13 +93,13 @@ pub enum SfmError {
         first: usize,
         /// The second.
         second: usize,
-        /// What was found and expected.
+        /// The values found and expected.
         what: String,
     },
-    /// The progress said to stop.
+    /// The receiver of the progress reports asked to stop.
     #[error("stopped")]
     Stopped,
-    /// The camera is none.
+    /// The camera is invalid.
     #[error(transparent)]
     Camera(#[from] CameraError),
     /// An option is out of range.

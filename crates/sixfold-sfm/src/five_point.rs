@@ -1,5 +1,5 @@
 //! The essential matrices of five pairs of rays: the constraints of Nistér (2004, "An efficient solution to the five-point relative
-//! pose problem", equations 7-9), solved by an action matrix (Stewénius, Engels and Nistér 2006). Copes with planes.
+//! pose problem", equations 7-9), solved by an action matrix (Stewénius, Engels and Nistér 2006). Works for planar scenes too.
 
 use sixfold_geometry::nalgebra::{Complex, SMatrix, SVector, Schur};
 use sixfold_geometry::{Mat3, Vec2};
@@ -27,9 +27,9 @@ const MONOMIALS: [[u8; 3]; 20] = [
     [0, 0, 1],
     [0, 0, 0],
 ];
-/// What x times each of the last ten is: a row of the reduced system, or another of the ten.
+/// The product of x and each of the last ten monomials: a row of the reduced system, or another of the ten.
 const TIMES_X: [usize; 10] = [0, 1, 2, 4, 5, 7, 10, 11, 13, 16];
-/// An eigenvalue is real where its imaginary part is below this fraction.
+/// An eigenvalue counts as real if its imaginary part is below this fraction.
 const REAL: f64 = 1e-7;
 
 /// A polynomial of degree up to 3 in x, y and z.
@@ -39,7 +39,7 @@ fn place(exponents: [u8; 3]) -> usize {
     MONOMIALS.iter().position(|m| *m == exponents).unwrap_or(19)
 }
 
-/// Where the product of two monomials is; only for products of degree up to 3.
+/// The indices of the products of two monomials; only for products of degree up to 3.
 fn products() -> [[usize; 20]; 20] {
     std::array::from_fn(|i| {
         std::array::from_fn(|j| {
@@ -102,7 +102,7 @@ pub fn essential_matrices(first: &[Vec2; 5], second: &[Vec2; 5]) -> Vec<Mat3> {
     values.iter().filter_map(of).collect()
 }
 
-/// The ten constraints after elimination of the monomials of degree 3: what each of these is in the last ten, negated.
+/// The ten constraints after elimination of the monomials of degree 3: each of these, negated, in terms of the last ten.
 fn reduced_system(basis: &[Mat3; 4]) -> Option<SMatrix<f64, 10, 10>> {
     let linear = |i: usize, j: usize| {
         let mut p = [0.0; 20];

@@ -1,17 +1,17 @@
-//! The two motions of the camera that explain the map which a plane makes between two photographs (Ma, Soatto, Košecká and Sastry
-//! 2004, "An Invitation to 3-D Vision", section 5.3.3).
+//! The two camera motions that explain the homography of a plane between two photographs (Ma, Soatto, Košecká and Sastry 2004, "An
+//! Invitation to 3-D Vision", section 5.3.3).
 
 use sixfold_geometry::homography::apply;
 use sixfold_geometry::nalgebra::{Rotation3, SymmetricEigen, UnitQuaternion};
 use sixfold_geometry::{Mat3, Pose, Vec2, Vec3};
 
-/// Squared distance of the second point from where the map takes the first.
+/// Squared distance of the second point to the mapped first point.
 pub(crate) fn transfer(map: &Mat3, (a, b): &(Vec2, Vec2)) -> f64 {
     apply(map, a).map_or(f64::INFINITY, |p| (p - b).norm_squared())
 }
 
-/// The motions (translation of length 1) that a plane's map allows with all points before both cameras: two, or fewer where the map
-/// is that of a rotation alone.
+/// The motions (translation of length 1) that a homography allows with all points in front of both cameras: two, or fewer if the
+/// homography comes from a pure rotation.
 pub(crate) fn motions(map: &Mat3, pairs: &[(Vec2, Vec2)]) -> Vec<Pose> {
     let singular = map.svd(false, false).singular_values;
     let mut sorted = [singular[0], singular[1], singular[2]];

@@ -1,5 +1,5 @@
-//! A reconstruction that grows photograph by photograph (Schönberger and Frahm 2016, "Structure-from-Motion Revisited", section 4): pose
-//! by PnP from the points that are known, new points, bundle adjustment, wrong observations out.
+//! A reconstruction that grows photograph by photograph (Schönberger and Frahm 2016, "Structure-from-Motion Revisited", section 4):
+//! pose by PnP from the known points, triangulation of new points, bundle adjustment, removal of wrong observations.
 
 use rayon::prelude::*;
 use sixfold_geometry::{PnpOptions, Pose, Vec2, Vec3, pnp_ransac};
@@ -11,22 +11,22 @@ use crate::options::SfmOptions;
 use crate::tracks::Track;
 use crate::triangulate::{triangulated, widest};
 
-/// Most pairs of photographs that a point is made from while wrong ones are sorted out.
+/// Maximum number of pairs of photographs from which a point is triangulated to reject wrong observations.
 const PAIRS: usize = 15;
-/// Fraction of the known points in a photograph that have to agree with its pose.
+/// Minimum fraction of the known points in a photograph that agree with its pose.
 const AGREEING: f64 = 0.2;
-/// The bundle is adjusted when there are this many times as many photographs as the last time.
+/// The bundle is adjusted again when the number of photographs has grown by this factor.
 const GROWTH: f64 = 1.15;
-/// How many times the threshold a photograph's points may be off while its pose is searched.
+/// Factor on the threshold while a photograph's pose is searched.
 const COARSE: f64 = 1.5;
 
-/// Numbers of the lens that may change: from few photographs, and from all.
+/// Lens parameters that may change: with few photographs, and with many.
 const FIRST: [usize; 2] = [0, 3];
 const ALL: [usize; 5] = [0, 1, 2, 3, 4];
-/// Photographs from which a lens is refined at all, and in all its numbers.
+/// Minimum number of photographs to refine the lens at all, and in all parameters.
 const ENOUGH: [usize; 2] = [4, 8];
 
-/// The present state.
+/// The current state.
 #[derive(Clone)]
 pub(crate) struct Growing<'a> {
     pub pixels: &'a [Vec<Vec2>],
@@ -35,13 +35,13 @@ pub(crate) struct Growing<'a> {
     pub guess: Lens,
     pub lens: Lens,
     pub poses: Vec<Option<Pose>>,
-    /// For each track its point, and which of its features show it.
+    /// For each track, its point and which of its features agree with it.
     pub points: Vec<Option<(Vec3, Vec<bool>)>>,
     pub left_out: Vec<Option<LeftOut>>,
 }
 
 impl<'a> Growing<'a> {
-    /// Two photographs with the motion between them; `None` where they share too few points.
+    /// Starts with two photographs and the motion between them; `None` if they have too few points in common.
     pub fn begun(
         pixels: &'a [Vec<Vec2>],
         tracks: &'a [Track],
@@ -65,12 +65,12 @@ impl<'a> Growing<'a> {
         self.poses.iter().flatten().count()
     }
 
-    /// How many observations agree.
+    /// Number of observations that agree.
     pub fn agreeing(&self) -> usize {
         self.points.iter().flatten().map(|(_, used)| used.iter().filter(|u| **u).count()).sum()
     }
 
-    /// Adds all photographs of `among` that can be; `go` is asked after each.
+    /// Adds all photographs of `among` that can be registered; `go` is called after each and can stop it.
     pub fn grow(&mut self, among: &[usize], go: &dyn Fn(usize) -> bool) -> bool {
         let mut adjusted_at = self.registered();
         let mut failed: Vec<usize> = vec![];
@@ -83,7 +83,7 @@ impl<'a> Growing<'a> {
                 .collect();
             let next = known.iter().max_by_key(|(count, i)| (*count, std::cmp::Reverse(*i)));
             let Some((_, next)) = next.copied() else {
-                // Those that failed once more, with all that has been added since.
+                // Retry those that failed, with everything added since.
                 let progress = again && !failed.is_empty() && self.registered() > 2;
                 if !progress {
                     break;
@@ -117,7 +117,7 @@ impl<'a> Growing<'a> {
         true
     }
 
-    /// Tracks with a point that a photograph shows, and its feature.
+    /// Tracks with a known point in a photograph, and the photograph's feature.
     fn known_in(&self, photograph: usize) -> Vec<(usize, u32)> {
         let mut known = vec![];
         for (i, track) in self.tracks.iter().enumerate() {
@@ -155,7 +155,7 @@ impl<'a> Growing<'a> {
         Ok(())
     }
 
-    /// Where registered photographs show a track: place in it, pose, pixel.
+    /// Observations of a track in registered photographs: index in the track, pose, pixel.
     fn shown(&self, track: &Track) -> Vec<(usize, Pose, Vec2)> {
         let of = |(k, (photograph, feature)): (usize, &(usize, u32))| {
             Some((k, self.poses[*photograph]?, self.pixels[*photograph][*feature as usize]))
@@ -163,7 +163,7 @@ impl<'a> Growing<'a> {
         track.iter().enumerate().filter_map(of).collect()
     }
 
-    /// Makes the points that can be, and lets each photograph that agrees show them.
+    /// Triangulates new points where possible, and adds the observations of all photographs that agree.
     pub fn add_points(&mut self) {
         let limit = self.options.threshold_px;
         let of = |i: usize| {
@@ -226,7 +226,7 @@ impl<'a> Growing<'a> {
         triangulated(&best.iter().map(|k| rays[*k]).collect::<Vec<_>>())
     }
 
-    /// Which numbers of the lens may change now.
+    /// The lens parameters that may change now.
     fn free(&self) -> &'static [usize] {
         match self.registered() {
             _ if !self.options.refine_camera => &[],
@@ -236,7 +236,7 @@ impl<'a> Growing<'a> {
         }
     }
 
-    /// Adjusts the bundle; observations that do not agree any more go.
+    /// Adjusts the bundle and removes observations that no longer agree.
     pub fn adjust(&mut self, iterations: usize) {
         let cameras: Vec<usize> = (0..self.poses.len()).filter(|i| self.poses[*i].is_some()).collect();
         let mut number = vec![usize::MAX; self.poses.len()];

@@ -1,13 +1,13 @@
-//! The camera of a reconstruction as numbers that can be refined: one focal length, the principal point, two radial coefficients.
+//! The parameters of a reconstruction's camera that can be refined: one focal length, the principal point, two radial coefficients.
 
 use sixfold_geometry::nalgebra::Vector5;
 use sixfold_geometry::{BrownConrady, Camera, Vec2, Vec3};
 
-/// How well a guess is believed before anything is seen: standard deviations of the focal length (fraction of it), the principal point
-/// (fraction of the longer side), and both radial coefficients.
+/// Prior standard deviations of a guess: the focal length (fraction of it), the principal point (fraction of the longer side), and
+/// both radial coefficients.
 const BELIEF: [f64; 4] = [0.3, 0.02, 0.2, 0.3];
 
-/// A pixel with its derivatives by the point (2x3, by rows) and by the numbers (2x5).
+/// A pixel with its derivatives by the point (2x3, by rows) and by the parameters (2x5).
 type Slopes = (Vec2, [[f64; 3]; 2], [[f64; 5]; 2]);
 
 /// `f cx cy k1 k2`; the ratio of the two focal lengths stays.
@@ -19,7 +19,7 @@ pub(crate) struct Lens {
 }
 
 impl Lens {
-    /// Of a camera, whose distortion beyond two radial coefficients is not kept: pixels are free of it.
+    /// The parameters of a camera. Distortion beyond two radial coefficients is dropped: the pixels have been corrected for it.
     pub fn of(camera: &Camera) -> Lens {
         let d = camera.distortion.unwrap_or_default();
         Lens {
@@ -42,14 +42,14 @@ impl Lens {
         other
     }
 
-    /// Standard deviations of the numbers as they are believed before anything is seen.
+    /// Prior standard deviations of the parameters.
     pub fn belief(&self) -> Vector5<f64> {
         let side = self.size.0.max(self.size.1) as f64;
         let [f, centre, k1, k2] = BELIEF;
         Vector5::new(f * self.numbers[0], centre * side, centre * side, k1, k2)
     }
 
-    /// The point on the plane `z = 1` that a pixel shows.
+    /// The point on the plane `z = 1` of a pixel's ray.
     pub fn ray(&self, pixel: &Vec2) -> Option<Vec2> {
         let [f, cx, cy, k1, k2] = [0, 1, 2, 3, 4].map(|i: usize| self.numbers[i]);
         let p = Vec2::new((pixel.x - cx) / f, (pixel.y - cy) / (f * self.ratio));
@@ -59,7 +59,7 @@ impl Lens {
         BrownConrady { k1, k2, p1: 0.0, p2: 0.0, k3: 0.0 }.undistort(&p)
     }
 
-    /// Where the image shows a point of the camera's frame.
+    /// The pixel of a point in the camera's frame.
     pub fn project(&self, p: &Vec3) -> Option<Vec2> {
         if !(p.z > 1e-9) {
             return None;

@@ -1,11 +1,12 @@
-//! Structure from motion: the camera's pose in photographs of one still scene, and points of the scene, from features alone.
+//! Structure from motion: the camera poses of photographs of one static scene, and points of the scene, from features alone.
 //!
-//! [`matched`] pairs features that choose each other, [`reconstruct`] finds poses and points: epipolar geometry of every pair
-//! ([`two_views`]; Nistér 2004, Stewénius et al. 2006), tracks over all photographs, photographs added one by one by PnP and
-//! triangulation (Schönberger and Frahm 2016), and a robust bundle adjustment (Triggs et al. 2000). Features come from anywhere.
+//! [`matched`] pairs features that are mutual nearest neighbours, [`reconstruct`] finds poses and points: epipolar geometry of
+//! every pair ([`two_views`]; Nistér 2004, Stewénius et al. 2006), tracks over all photographs, photographs added one by one by
+//! PnP and triangulation (Schönberger and Frahm 2016), and a robust bundle adjustment (Triggs et al. 2000). The features can
+//! come from any detector.
 //!
-//! Nothing here knows lengths: the unit is the median distance of a photograph from the points that it shows. The same
-//! input and seed give the same poses, at any number of threads.
+//! The scale is unknown: the unit of length is the median distance of a photograph from its points. The same input and seed give
+//! the same poses, for any number of threads.
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
 

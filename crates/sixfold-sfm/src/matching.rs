@@ -1,5 +1,5 @@
-//! Features of two photographs that choose each other (mutual nearest neighbours of descriptors), where descriptors do not bear that a
-//! photograph is rotated also with the second photograph rotated.
+//! Matches of features in two photographs: mutual nearest neighbours of descriptors. For descriptors that are not invariant to
+//! rotation, the second photograph can also be rotated.
 
 use rayon::prelude::*;
 use sixfold_geometry::nalgebra::DMatrix;
@@ -8,7 +8,7 @@ use sixfold_geometry::{Progress, Vec2};
 /// Features of a photograph.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Features {
-    /// Where they are, pixels.
+    /// Their positions, pixels.
     pub points: Vec<Vec2>,
     /// Their descriptors one after the other, each of length 1.
     pub descriptors: Vec<f32>,
@@ -16,11 +16,11 @@ pub struct Features {
     pub rotated: Vec<Vec<f32>>,
 }
 
-/// Features by which the rotation of a pair is chosen: the first of each photograph.
+/// Number of features that choose the rotation of a pair: the first ones of each photograph.
 const SCREENED: usize = 512;
 
 impl Features {
-    /// Descriptors as columns: as the photograph is, then rotated.
+    /// Descriptors as columns: of the unrotated photograph, then of the rotated ones.
     fn matrices(&self) -> Vec<DMatrix<f32>> {
         let count = self.points.len().max(1);
         let of = |descriptors: &Vec<f32>| {
@@ -31,7 +31,7 @@ impl Features {
     }
 }
 
-/// What two photographs have in common.
+/// The matches of two photographs.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct PairMatches {
     /// Numbers of the photographs, the smaller first.
@@ -40,9 +40,9 @@ pub struct PairMatches {
     pub matches: Vec<(u32, u32)>,
 }
 
-/// Features of every pair of photographs that choose each other and whose product is at least `least`, with the rotation of the second
-/// photograph that matches most; `None` when `progress` said to stop. All descriptors have the same length, and features are the
-/// best ones first.
+/// Mutual nearest neighbours in every pair of photographs whose descriptors' product is at least `least`, with the rotation of the
+/// second photograph that gives most matches; `None` when `progress` asked to stop. All descriptors have the same length, and
+/// features are sorted best first.
 pub fn matched(features: &[Features], least: f32, progress: &dyn Progress) -> Option<Vec<PairMatches>> {
     let matrices: Vec<Vec<DMatrix<f32>>> = features.iter().map(Features::matrices).collect();
     let pairs: Vec<(usize, usize)> =
@@ -73,7 +73,7 @@ fn best_matches(a: &DMatrix<f32>, b: &[DMatrix<f32>], least: f32) -> Vec<(u32, u
     let best = if b.len() > 1 {
         let few = first(a);
         let counts: Vec<usize> = b.iter().map(|b| mutual(&few, &first(b), least).len()).collect();
-        // The first of equal ones.
+        // The first one of several with equal counts.
         (0..b.len()).max_by_key(|k| (counts[*k], std::cmp::Reverse(*k))).unwrap_or(0)
     } else {
         0

@@ -1,25 +1,26 @@
-//! What a reconstruction may be told.
+//! Options of a reconstruction.
 
 use sixfold_geometry::OptionError;
 
-/// How photographs are put together.
+/// Options of a reconstruction.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SfmOptions {
     /// Two features of a pair of photographs agree within this distance, pixels.
     pub threshold_px: f64,
-    /// Most samples of five matches per pair.
+    /// Maximum number of samples of five matches per pair.
     pub samples: usize,
-    /// Fewest matches that make a pair of photographs one, and that a photograph needs with the points that are known.
+    /// Minimum number of matches of a pair of photographs, and of a photograph with the known points.
     pub min_matches: usize,
-    /// Fewest features of a photograph.
+    /// Minimum number of features of a photograph.
     pub min_features: usize,
-    /// Fewest photographs that are put together.
+    /// Minimum number of registered photographs.
     pub min_photographs: usize,
     /// Smallest angle between two rays to a point, degrees.
     pub min_angle: f64,
-    /// The camera is a guess: its focal length is searched, then refined with principal point and two radial coefficients.
+    /// Whether the camera is a guess: then its focal length is searched, and refined together with principal point and two
+    /// radial coefficients.
     pub refine_camera: bool,
-    /// The guess's focal length is what the camera says of itself (EXIF): it is tried as it is, before others.
+    /// Whether the guess's focal length comes from the camera (EXIF): then it is tried unchanged before others.
     pub focal_length_from_camera: bool,
     /// Seed of all samples.
     pub seed: u64,

@@ -1,5 +1,5 @@
-//! From matches to poses and points: geometry of all pairs, the largest group of photographs that match, several beginnings, the best of
-//! which is kept.
+//! From matches to poses and points: geometry of all pairs, the largest group of matching photographs, and several initial pairs,
+//! of which the best result is kept.
 
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 
@@ -14,36 +14,37 @@ use crate::options::SfmOptions;
 use crate::tracks::{Track, joined};
 use crate::two_view::{TwoViews, two_views};
 
-/// Focal lengths that are tried where the camera is a guess, as fractions of the guess, and pairs of photographs they are tried on.
+/// Focal lengths that are tried if the camera is a guess, as fractions of the guess, and the number of pairs of photographs used.
 const FOCAL_LENGTHS: [f64; 7] = [0.6, 0.7, 0.82, 0.95, 1.1, 1.3, 1.55];
 const FOCAL_PAIRS: usize = 12;
-/// Most beginnings that are tried.
+/// Maximum number of initial pairs that are tried.
 const BEGINNINGS: usize = 6;
-/// A beginning that registers this fraction of the photographs is good enough.
+/// An initial pair that leads to this fraction of registered photographs is good enough.
 const GOOD: f64 = 0.95;
-/// Angle above which a larger one makes no better beginning, degrees; and what a plane counts as one.
+/// Angle above which a larger one does not make a better initial pair, degrees; and the factor for planar pairs.
 const WIDE: f64 = 16.0;
 const PLANE: f64 = 0.6;
 
 /// A point of the scene.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ScenePoint {
-    /// Where it is.
+    /// Its position.
     pub position: Vec3,
     /// Photographs that show it, and the feature in each.
     pub seen: Vec<(usize, u32)>,
 }
 
-/// Photographs put together. The unit of length is the median distance of a photograph from the points that it shows.
+/// A reconstruction. The unit of length is the median distance of a photograph from its points.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Reconstruction {
-    /// The camera, refined where it was a guess.
+    /// The camera, refined if it was a guess.
     pub camera: Camera,
-    /// For each photograph the camera's pose, or why it has none; the first that has one is the world's frame.
+    /// For each photograph the camera's pose, or why it has none; the camera frame of the first photograph with a pose is the
+    /// world's frame.
     pub camera_from_world: Vec<Result<Pose, LeftOut>>,
     /// Points of the scene.
     pub points: Vec<ScenePoint>,
-    /// Root of the mean squared distance between features and where the points are seen, pixels.
+    /// Root mean square reprojection error, pixels.
     pub rms_px: f64,
 }
 
@@ -51,9 +52,9 @@ pub struct Reconstruction {
 type Pair = ((usize, usize), TwoViews, Vec<(u32, u32)>);
 type Pairs = Vec<Pair>;
 
-/// Puts photographs of one still scene together. `pixels` holds the features of each photograph in its raw pixels, `matches` those of
-/// pairs that belong together (wrong ones among them), `camera` that of all photographs: exact, or a guess if
-/// [`SfmOptions::refine_camera`] says so. Progress counts pairs of photographs, then photographs.
+/// Reconstructs a static scene from photographs. `pixels` holds the features of each photograph in raw pixels, `matches` the
+/// matches of pairs (which may contain wrong ones), `camera` the camera of all photographs: exact, or a guess if
+/// [`SfmOptions::refine_camera`] is set. Progress counts pairs of photographs, then photographs.
 ///
 /// # Errors
 /// [`SfmError`].
@@ -122,12 +123,12 @@ fn check_matches(pixels: &[Vec<Vec2>], matches: &[PairMatches]) -> Result<(), Sf
     Ok(())
 }
 
-/// Pixels without the distortion of a camera that is known.
+/// Pixels without the distortion of a known camera.
 fn without_lens(pixels: &[Vec<Vec2>], camera: &Camera, options: &SfmOptions) -> Vec<Vec<Vec2>> {
     if options.refine_camera {
         return pixels.to_vec();
     }
-    // What the lens folds over lies far outside and agrees with nothing.
+    // Pixels whose distortion cannot be inverted are moved far outside, where they agree with nothing.
     let of = |p: &Vec2| camera.undistort_point(p).unwrap_or(Vec2::repeat(-1e6));
     pixels.iter().map(|all| all.iter().map(of).collect()).collect()
 }
@@ -157,9 +158,9 @@ fn with_best_focal_length(
 ) -> Lens {
     let mut strongest = all.to_vec();
     strongest.sort_by_key(|m| (std::cmp::Reverse(m.matches.len()), m.pair));
-    // Neighbouring photographs say little: of three times as many every third.
+    // Neighbouring pairs are similar: take every third of three times as many.
     let chosen: Vec<&PairMatches> = strongest.into_iter().step_by(3).take(FOCAL_PAIRS).collect();
-    // A tight threshold: what is wrong by a few pixels is to be seen.
+    // A tight threshold, so that errors of a few pixels show.
     let tight = SfmOptions { threshold_px: 0.5 * options.threshold_px, ..*options };
     let agreeing = |factor: &f64| {
         let lens = lens.with_focal_length(factor * lens.numbers[0]);
@@ -170,7 +171,7 @@ fn with_best_focal_length(
     let factors: Vec<f64> = as_it_is.into_iter().chain(FOCAL_LENGTHS).collect();
     let counts: Vec<usize> = factors.iter().map(agreeing).collect();
     let most = counts.iter().copied().max().unwrap_or(0);
-    // The nearest to the guess among those that are as good as the best.
+    // The nearest to the guess among those that are about as good as the best.
     let best = factors
         .iter()
         .zip(&counts)
@@ -179,7 +180,7 @@ fn with_best_focal_length(
     best.map_or(*lens, |(factor, _)| lens.with_focal_length(factor * lens.numbers[0]))
 }
 
-/// The geometry of all pairs that have one; `None` when told to stop.
+/// The geometry of all pairs that have one; `None` when asked to stop.
 fn geometry(
     lens: &Lens,
     pixels: &[Vec<Vec2>],
@@ -206,8 +207,8 @@ fn geometry(
 
 type Group = (Vec<usize>, Vec<Option<LeftOut>>);
 
-/// The largest group of photographs that match, and why the others are not in it. `most` holds for each photograph the most matches with
-/// another that agree with a motion.
+/// The largest group of matching photographs, and why the others are not in it. `most` holds for each photograph the largest number
+/// of matches with another one that agree with a motion.
 fn largest_group(
     pixels: &[Vec<Vec2>],
     pairs: &Pairs,

@@ -1,5 +1,5 @@
-//! The motion of the camera between two photographs from an essential matrix (Hartley and Zisserman 2004, section 9.6), and made
-//! better by Sampson's error (equation 11.9) over all inliers.
+//! The motion of the camera between two photographs from an essential matrix (Hartley and Zisserman 2004, section 9.6), and its
+//! refinement by Sampson's error (equation 11.9) over all inliers.
 
 use sixfold_geometry::nalgebra::{Matrix5, Rotation3, UnitQuaternion, Vector5};
 use sixfold_geometry::{Mat3, Pose, Vec2, Vec3};
@@ -10,7 +10,7 @@ pub(crate) fn essential(motion: &Pose) -> Mat3 {
     Mat3::new(0.0, -t.z, t.y, t.z, 0.0, -t.x, -t.y, t.x, 0.0) * motion.rotation_matrix()
 }
 
-/// Sampson's error with its sign, on the planes `z = 1`.
+/// Sampson's signed error, on the planes `z = 1`.
 pub(crate) fn sampson(e: &Mat3, (a, b): &(Vec2, Vec2)) -> f64 {
     let (a, b) = (a.push(1.0), b.push(1.0));
     let (line, back) = (e * a, e.tr_mul(&b));
@@ -18,7 +18,7 @@ pub(crate) fn sampson(e: &Mat3, (a, b): &(Vec2, Vec2)) -> f64 {
     b.dot(&line) / slope.max(1e-300).sqrt()
 }
 
-/// The depths of a point in both cameras, of the rays' nearest points; `None` for rays that are parallel.
+/// The depths of a point in both cameras, at the nearest points of the rays; `None` for parallel rays.
 fn depths(motion: &Pose, (a, b): &(Vec2, Vec2)) -> Option<(f64, f64)> {
     // d2 b = d1 R a + t, by least squares.
     let (u, v, t) = (motion.transform_direction(&a.push(1.0)), b.push(1.0), motion.translation());
@@ -31,7 +31,7 @@ fn depths(motion: &Pose, (a, b): &(Vec2, Vec2)) -> Option<(f64, f64)> {
     Some(((uv * vt - vv * ut) / determinant, (uu * vt - uv * ut) / determinant))
 }
 
-/// How many points lie before both cameras.
+/// Number of points in front of both cameras.
 pub(crate) fn before_both(motion: &Pose, pairs: &[(Vec2, Vec2)]) -> usize {
     pairs
         .iter()
@@ -45,11 +45,11 @@ pub(crate) fn parallax(motion: &Pose, (a, b): &(Vec2, Vec2)) -> f64 {
     u.cross(&v).norm().atan2(u.dot(&v))
 }
 
-/// Of the four motions of an essential matrix the one with most points before both cameras; its translation has length 1.
+/// The one of the four motions of an essential matrix with most points in front of both cameras; its translation has length 1.
 pub(crate) fn motion_of(e: &Mat3, pairs: &[(Vec2, Vec2)]) -> Option<Pose> {
     let svd = e.svd(true, true);
     let (mut u, mut v) = (svd.u?, svd.v_t?);
-    // The smallest singular value last.
+    // Sort so that the smallest singular value is last.
     let mut order = [0, 1, 2];
     order.sort_by(|a, b| svd.singular_values[*b].total_cmp(&svd.singular_values[*a]));
     u = Mat3::from_columns(&order.map(|i| u.column(i).into_owned()));

@@ -1,10 +1,11 @@
-//! Tracks: features of several photographs that show one point. Matches are joined, the strongest pairs of photographs first, unless
-//! that would give a point two features in one photograph.
+//! Tracks: features of several photographs that show the same point. Matches are joined, the strongest pairs of photographs first,
+//! unless this would give a point two features in one photograph.
 
-/// A track: for each photograph that shows the point, which one and its feature; by photograph.
+/// A track: index and feature of each photograph that shows the point, sorted by photograph.
 pub(crate) type Track = Vec<(usize, u32)>;
 
-/// Joins matches of features, the most trusted first. `counts` are the numbers of features of the photographs.
+/// Joins matches of features, which must be sorted by trust, the most trusted first. `counts` are the numbers of features of the
+/// photographs.
 pub(crate) fn joined(counts: &[usize], matches: impl Iterator<Item = [(usize, u32); 2]>) -> Vec<Track> {
     let mut first = vec![0usize];
     counts.iter().for_each(|count| first.push(first[first.len() - 1] + count));

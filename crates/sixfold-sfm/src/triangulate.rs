@@ -1,4 +1,4 @@
-//! A point of the scene from where several photographs show it: the point nearest to all rays, then least squares of reprojection errors.
+//! Triangulation of a point from several photographs: the point nearest to all rays, then least squares of reprojection errors.
 
 use sixfold_geometry::nalgebra::Matrix3;
 use sixfold_geometry::{Mat3, Pose, Vec2, Vec3};
@@ -6,7 +6,7 @@ use sixfold_geometry::{Mat3, Pose, Vec2, Vec3};
 /// Iterations of Gauss-Newton.
 const ITERATIONS: usize = 8;
 
-/// The point of the world that cameras see in directions through points on the planes `z = 1`; `None` where rays are parallel or the
+/// The point of the world on the rays through points on the planes `z = 1` of several cameras; `None` if rays are parallel or the
 /// point is behind a camera. Poses take points of the world to the cameras.
 pub fn triangulated(seen: &[(Pose, Vec2)]) -> Option<Vec3> {
     let (mut h, mut g) = (Matrix3::zeros(), Vec3::zeros());

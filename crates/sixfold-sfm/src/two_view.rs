@@ -1,5 +1,5 @@
-//! What two photographs say of the camera's motion between them: RANSAC (Fischler and Bolles 1981) over the five-point method, and the
-//! homography where all matches lie on one plane, for a plane allows two motions.
+//! The camera's motion between two photographs: RANSAC (Fischler and Bolles 1981) over the five-point method, and the homography if
+//! all matches lie on one plane, because a plane allows two motions.
 
 use rand::RngExt;
 use sixfold_geometry::homography::homography;
@@ -11,32 +11,32 @@ use crate::five_point::essential_matrices;
 use crate::homography::{motions, transfer};
 use crate::relative::{before_both, essential, motion_of, parallax, refined, sampson};
 
-/// A sample without a wrong match is taken with this probability.
+/// Probability that at least one sample contains no wrong match.
 const CONFIDENCE: f64 = 0.999;
-/// The matches lie on one plane where its map holds for this fraction of those that agree with the motion.
+/// The matches count as planar if a homography holds for this fraction of those that agree with the motion.
 const PLANAR: f64 = 0.9;
-/// Samples of four matches for the plane's map.
+/// Samples of four matches for the homography.
 const PLANE_SAMPLES: usize = 100;
-/// Passes in which the motion is made better with what agrees best.
+/// Passes of refining the motion with the best matches.
 const PASSES: usize = 3;
-/// Fraction of the agreeing matches that must lie before both cameras.
+/// Minimum fraction of the agreeing matches in front of both cameras.
 const BEFORE: f64 = 0.7;
 
 /// The geometry of two photographs.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TwoViews {
-    /// Numbers of the matches that agree with the motion.
+    /// Indices of the matches that agree with the motion.
     pub inliers: Vec<usize>,
-    /// Takes points of the first camera's frame to the second's, translation of length 1; with points on a plane perhaps two.
+    /// Takes points of the first camera's frame to the second's, translation of length 1; for points on a plane there may be two.
     pub motions: Vec<Pose>,
     /// Median angle between the two rays to a point, degrees.
     pub angle: f64,
-    /// All agreeing matches lie on one plane.
+    /// Whether all agreeing matches lie on one plane.
     pub planar: bool,
 }
 
-/// The motion that most matches agree with. `pairs` are points on the planes `z = 1`; `threshold` is a distance there. `None` for fewer
-/// than eight matches and where no motion has eight that agree. The same input and seed give the same motion.
+/// The motion that most matches agree with. `pairs` are points on the planes `z = 1`; `threshold` is a distance there. `None` for
+/// fewer than eight matches, or if no motion has eight that agree. The same input and seed give the same motion.
 pub fn two_views(pairs: &[(Vec2, Vec2)], threshold: f64, samples: usize, seed: u64) -> Option<TwoViews> {
     let count = pairs.len();
     if count < 8 {
@@ -61,7 +61,7 @@ pub fn two_views(pairs: &[(Vec2, Vec2)], threshold: f64, samples: usize, seed: u
             let inliers = agreeing(e);
             let of: Vec<(Vec2, Vec2)> = inliers.iter().map(|i| pairs[*i]).collect();
             let Some(motion) = motion_of(&e, &of) else { continue };
-            // What a sample gives is noisy: better once over all that agree.
+            // The motion of a sample is noisy: refine it over all matches that agree.
             let motion = refined(&motion, pairs, 2.0 * threshold, 3);
             let e = essential(&motion);
             let sum = sum.max(gain(e));
@@ -75,7 +75,8 @@ pub fn two_views(pairs: &[(Vec2, Vec2)], threshold: f64, samples: usize, seed: u
         }
     }
     let mut motion = refined(&best?.1, pairs, threshold, 20);
-    // Again without what is off by more than four standard deviations: a wrong match within the threshold pulls at a narrow view.
+    // Repeat without residuals above four standard deviations: in a narrow view, a wrong match within the threshold has a strong
+    // influence.
     for _ in 0..PASSES {
         let e = essential(&motion);
         let mut errors: Vec<f64> =
@@ -97,7 +98,7 @@ fn of_motion(pairs: &[(Vec2, Vec2)], motion: &Pose, threshold: f64, seed: u64) -
     let motion = motion_of(&e, &of)?;
     let mut angles: Vec<f64> = of.iter().map(|p| parallax(&motion, p).to_degrees()).collect();
     let angle = median(&mut angles)?;
-    // Rays that are nearly parallel meet anywhere: their points are not before the cameras, which says nothing.
+    // Nearly parallel rays intersect anywhere, so whether their points are in front of the cameras carries no information.
     if angle > 1.0 && (before_both(&motion, &of) as f64) < BEFORE * of.len() as f64 {
         return None;
     }
@@ -118,7 +119,7 @@ fn of_motion(pairs: &[(Vec2, Vec2)], motion: &Pose, threshold: f64, seed: u64) -
     Some(TwoViews { inliers, motions, angle, planar })
 }
 
-/// The map of a plane that holds nearly all matches.
+/// The homography of a plane that contains nearly all matches.
 fn plane(pairs: &[(Vec2, Vec2)], threshold: f64, seed: u64) -> Option<Mat3> {
     let mut random = stream(seed, 1);
     // Transfer errors are about twice as long as distances from epipolar lines.

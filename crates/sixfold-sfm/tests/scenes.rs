@@ -1,4 +1,4 @@
-//! Photographs of points whose truth is known, put together again.
+//! Reconstructions from simulated photographs of points with known ground truth.
 
 use rand::RngExt;
 use sixfold_geometry::random::{Random, normal, stream};
@@ -34,7 +34,7 @@ fn camera() -> Camera {
     Camera::new(980.0, 980.0, 511.5, 383.5, 1024, 768).unwrap()
 }
 
-/// A table with, unless `flat`, things on it.
+/// Points of a table with objects on it, or without objects if `flat`.
 fn points(count: usize, flat: bool, random: &mut Random) -> Vec<Vec3> {
     (0..count)
         .map(|i| {
@@ -46,7 +46,7 @@ fn points(count: usize, flat: bool, random: &mut Random) -> Vec<Vec3> {
 }
 
 impl Scene {
-    /// Every photograph shows all points; `noise` in pixels, `wrong` the fraction of matches that are.
+    /// Every photograph shows all points; `noise` in pixels, `wrong` is the fraction of wrong matches.
     fn new(poses: Vec<Pose>, camera: Camera, flat: bool, noise: f64, wrong: f64) -> Scene {
         let mut random = stream(3, 0);
         let points = points(300, flat, &mut random);
@@ -61,7 +61,7 @@ impl Scene {
         let mut matches = vec![];
         for b in 0..poses.len() {
             for a in 0..b {
-                // Points are recognised from sides that are not too far apart.
+                // Points are matched between viewpoints that are not too far apart.
                 let side = |p: &Pose| p.inverse().translation().normalize();
                 if side(&poses[a]).dot(&side(&poses[b])) < 0.3 {
                     continue;
@@ -79,7 +79,7 @@ impl Scene {
         reconstruct(&self.pixels, &self.matches, camera, options, &())
     }
 
-    /// Largest errors of positions (metres) and rotations (radians), after the similarity that fits best.
+    /// Largest errors of positions (metres) and rotations (radians), after the best similarity.
     fn errors(&self, found: &Reconstruction) -> [f64; 2] {
         let known: Vec<(usize, Pose)> = found
             .camera_from_world
@@ -143,7 +143,7 @@ fn a_camera_that_is_a_guess_is_found_too() {
 
 #[test]
 fn a_focal_length_that_the_camera_names_helps_with_a_lens_that_nobody_guesses() {
-    // The telephoto lens of a telephone: 77 mm on 35 mm film.
+    // The telephoto lens of a phone: 77 mm on 35 mm film.
     let truth = Camera::new(2278.0, 2278.0, 511.5, 383.5, 1024, 768).unwrap();
     let scene = Scene::new(around(12), truth, false, 0.5, 0.1);
     let error = |f: f64, focal_length_from_camera: bool| {
@@ -152,7 +152,7 @@ fn a_focal_length_that_the_camera_names_helps_with_a_lens_that_nobody_guesses() 
         let found = scene.found(&guess, &options).ok()?;
         Some((found.camera.fx / truth.fx - 1.0).abs())
     };
-    // What the file says is rounded, and lenses breathe: three per cent off.
+    // The value in the file is rounded, and the focal length changes with focus: an error of three per cent.
     let (named, guessed) = (error(1.03 * truth.fx, true), error(0.9 * 1024.0, false));
     assert!(named.is_some_and(|named| named < 0.01), "{named:?}");
     assert!(guessed.is_none_or(|guessed| guessed > 0.05), "{guessed:?}");

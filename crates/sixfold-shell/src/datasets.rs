@@ -7,10 +7,10 @@ use sixfold_bop::{BopDataset, Target};
 
 use crate::ranges::without_duplicates;
 
-/// What stands for every annotated pose in place of a file of targets.
+/// The value of `--targets` that selects every annotated pose instead of a file.
 const ALL: &str = "all";
 
-/// A dataset with one of its splits, and the models of one of its folders where one is named.
+/// Opens a dataset with one of its splits, and with the models of the folder `models` if given.
 ///
 /// # Errors
 /// When there is no such dataset, split or folder.
@@ -22,8 +22,8 @@ pub fn open(root: &Path, split: &str, models: Option<&str>) -> Result<BopDataset
     }
 }
 
-/// The targets of `--targets`: those of a file, with `all` every annotated pose that is at least 10 % visible, without one those that
-/// the dataset names.
+/// The targets of `--targets`: from a file; with `all`, every annotated pose that is at least 10 % visible; without the option, the
+/// dataset's own targets.
 ///
 /// # Errors
 /// When the file or a scene is missing or broken.
@@ -32,7 +32,7 @@ pub fn targets(dataset: &BopDataset, file: Option<&Path>) -> Result<Vec<Target>>
     Ok(if all { dataset.all_targets()? } else { dataset.targets(file)? })
 }
 
-/// The targets of some objects alone, those of whole images spelled out; all of them where `ids` is empty.
+/// The targets of the objects `ids` only, those of whole images expanded to objects; all targets where `ids` is empty.
 ///
 /// # Errors
 /// When a scene is missing or broken.

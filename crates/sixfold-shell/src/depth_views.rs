@@ -1,4 +1,4 @@
-//! Objects that are known from depth images alone: the files, and templates of them.
+//! Objects that are known from depth images alone: reading the files and making templates of them.
 
 use std::path::{Path, PathBuf};
 
@@ -55,7 +55,7 @@ pub struct LeftOut {
     beyond_edges: f64,
 }
 
-/// A mask without what depth shows to be something else; warns where that is much.
+/// A mask without the pixels that depth shows to belong to something else; warns where many were removed.
 fn checked(path: &Path, depth: &DepthImage, camera: &Camera, mask: &Mask) -> Result<(Mask, LeftOut)> {
     let file = path.display().to_string();
     let advice = || format!("{file}: too large a mask (--mask-as-is takes it as it is)");

@@ -1,5 +1,5 @@
-//! Folders that commands write: one writer at a time, nothing of anybody else replaced. A dataset is resumed with the options
-//! and the inputs that it was begun with; a folder of images knows which files are its own.
+//! Folders that commands write: one writer at a time, and files of others are never replaced. A dataset can only be resumed
+//! with the options and the inputs that it was started with; a folder of images keeps a list of the files that commands wrote.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::{Read, Write};
@@ -13,12 +13,12 @@ use sixfold_mesh::{Mesh, ModelInfo, ModelsInfo, PlyFormat, Unit, ply_files};
 
 use crate::output::write_atomically;
 
-/// Holds the options that decide about a dataset, and what its inputs held.
+/// Holds the options of a dataset and the hashes of its inputs.
 const OPTIONS: &str = "options.json";
 /// Lists the files of a folder that commands wrote.
 const OWN_FILES: &str = ".sixfold-files";
 
-/// What the inputs of a command hold: hashes by name. Paths alone say nothing: files change.
+/// Hashes of the contents of a command's inputs, by name. Paths are not enough, since files change.
 #[derive(Debug, Default)]
 pub struct Contents(BTreeMap<String, Fnv1a>);
 
@@ -28,7 +28,7 @@ impl Contents {
         self.0.entry(name.into()).or_default()
     }
 
-    /// Takes in a file, or the files of a folder with their names.
+    /// Adds a file, or the files of a folder with their names.
     ///
     /// # Errors
     /// When one cannot be read.
@@ -48,7 +48,7 @@ impl Contents {
         Ok(())
     }
 
-    /// Takes in an object: everything of its mesh, and what is known of it.
+    /// Adds an object: its whole mesh, diameter and symmetries.
     pub fn add_object(&mut self, name: &str, mesh: &Mesh, info: &ModelInfo) {
         let hash = self.of(name);
         hash.write(&mesh.contents_hash().to_le_bytes());
@@ -68,13 +68,13 @@ pub struct DatasetFolder {
 }
 
 impl DatasetFolder {
-    /// Takes the folder for `command` with these options, an object of them. `inputs` are what the command reads.
+    /// Takes the folder for `command` with these options, a JSON object. `inputs` are the paths that the command reads.
     ///
     /// # Errors
-    /// When the folder is an input, another process writes it, it was begun with other options, or holds anything else.
+    /// When the folder is an input, another process writes it, it was started with other options, or it holds anything else.
     pub fn take(path: &Path, command: &str, mut options: Value, inputs: &[&Path]) -> Result<DatasetFolder> {
         let lock = lock(path)?;
-        // With the lock the folders on the way are there: only now a path with `..` says where it leads.
+        // The lock created the parent folders: only now can a path with `..` be resolved.
         refuse_inputs(path, inputs)?;
         options["command"] = json!(command);
         let folder = DatasetFolder { path: path.to_path_buf(), options, _lock: lock };
@@ -85,11 +85,11 @@ impl DatasetFolder {
         Ok(folder)
     }
 
-    /// Keeps what the inputs hold, or compares it with what they held when the folder was begun. Before that nothing is
-    /// written.
+    /// Stores the hashes of the inputs, or compares them with those stored when the folder was started. Nothing is written
+    /// before that.
     ///
     /// # Errors
-    /// When they held something else: what is in the folder would belong to other objects than what is added.
+    /// When the inputs have changed: new images would belong to other objects than those in the folder.
     pub fn begin(&self, contents: &Contents) -> Result<()> {
         let contents = contents.to_json();
         match self.kept()? {
@@ -151,7 +151,7 @@ impl DatasetFolder {
     /// Writes a file of the folder unless it is there and equal.
     ///
     /// # Errors
-    /// When it is there and holds something else: images that are there already belong to it.
+    /// When it exists with other contents: images in the folder already belong to it.
     pub(crate) fn write_once(&self, file: &Path, bytes: &[u8]) -> Result<()> {
         match std::fs::read(file) {
             Ok(there) if there == bytes => Ok(()),
@@ -165,8 +165,8 @@ impl DatasetFolder {
     }
 }
 
-/// The lock of a folder, the same by whatever path it is named. It lies beside the folder, which need not exist, or in it where
-/// beside it nothing can be written, as beside a mounted folder.
+/// The lock of a folder, the same for every path to it. The lock file is beside the folder, which need not exist, or inside it
+/// where nothing can be written beside it, as for a mounted folder.
 fn lock(path: &Path) -> Result<WriteLock> {
     let place = path.canonicalize().unwrap_or_else(|_| path.to_path_buf());
     match WriteLock::take(&place) {
@@ -207,7 +207,7 @@ fn refuse_contents(out: &Path) -> Result<()> {
     }
 }
 
-/// A folder for a command's images and files beside whatever is there.
+/// A folder for a command's images and files, which may hold other files too.
 pub struct OutputFolder {
     path: PathBuf,
     own: BTreeSet<String>,
@@ -231,15 +231,15 @@ impl OutputFolder {
         &self.path
     }
 
-    /// The path of a file that is to be written, which is then one of the folder's own.
+    /// The path of a file to be written, which is added to the list of the folder's own files.
     ///
     /// # Errors
-    /// When it is there and no command wrote it.
+    /// When the file exists and no command wrote it.
     pub fn file(&mut self, name: &str) -> Result<PathBuf> {
         Ok(self.files(&[name])?.remove(0))
     }
 
-    /// The paths of all files that are to be written: either all of them can be, or none is touched.
+    /// The paths of all files to be written: either all of them can be written, or none is touched.
     ///
     /// # Errors
     /// As [`OutputFolder::file`].
@@ -293,12 +293,12 @@ fn note_files(list: &Path, names: &[String]) -> std::io::Result<()> {
     let mut file = std::fs::File::options().append(true).read(true).create(true).open(list)?;
     let mut before = vec![];
     file.read_to_end(&mut before)?;
-    // A process that was killed may have left half a line.
+    // A process that was killed may have left an incomplete line.
     let gap = if before.last().is_some_and(|byte| *byte != b'\n') { "\n" } else { "" };
     file.write_all(format!("{gap}{}\n", names.join("\n")).as_bytes())
 }
 
-/// Copies the files of a folder, those in folders within it excepted.
+/// Copies the files of a folder, without subfolders.
 ///
 /// # Errors
 /// When one cannot be read or written.
@@ -336,7 +336,7 @@ mod tests {
             contents.add_path("mesh", &input).unwrap();
             contents
         };
-        // Its input, by any path, and what is not its own.
+        // Refused: its input by any path, and a folder with files that are not its own.
         for path in ["dataset", "new/../dataset", "./dataset/"] {
             assert!(error(take(&root.path().join(path), 1)).contains("is the input"), "{path}");
         }

@@ -1,4 +1,4 @@
-//! What was found in an image, for files, screen and people: `poses.json` and the table first, then the images.
+//! Output of the poses found in an image: first `poses.json` and the table, then the images.
 
 use anyhow::Result;
 use sixfold_geometry::{Camera, DepthImage, Mask, RgbImage};
@@ -24,7 +24,7 @@ pub struct SearchedImage<'a> {
 
 impl SearchedImage<'_> {
     /// Writes the poses into the folder `out` and prints them, then writes the images. An image that cannot be written is
-    /// reported and costs no poses.
+    /// reported; the poses are kept.
     ///
     /// # Errors
     /// When the poses cannot be written.
@@ -105,7 +105,7 @@ impl SearchedImage<'_> {
     }
 }
 
-/// The poses that were found in an image of a dataset over it; none for an image without pixels.
+/// An image of a dataset with the poses found in it drawn over; `None` for an image without pixels.
 ///
 /// # Errors
 /// When the image cannot be read.

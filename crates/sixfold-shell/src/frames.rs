@@ -1,4 +1,4 @@
-//! Which frames of a dataset a command leaves out.
+//! The frames of a dataset that a command leaves out.
 
 use std::collections::BTreeSet;
 use std::path::Path;

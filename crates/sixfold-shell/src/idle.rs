@@ -1,13 +1,13 @@
-//! Options that would be without effect beside the others that were given: refused by name rather than ignored.
+//! Options that would have no effect in combination with the other options: refused by name rather than ignored.
 //!
-//! `clap` has `requires` and `conflicts_with`. They do not do for options with a default or an environment variable, which count
-//! as given, nor for values of other options, nor where one of the required options conflicts with what is given.
+//! `clap` has `requires` and `conflicts_with`. They do not work for options with a default or an environment variable, which
+//! count as given, for values of other options, or where one of the required options conflicts with a given one.
 
 use clap::error::ErrorKind;
 use clap::parser::ValueSource;
 use clap::{ArgMatches, Command};
 
-/// What else has to be so for an option to be without effect. Options by `clap`'s names for them.
+/// A condition under which an option has no effect. Options are named by their `clap` ids.
 #[derive(Debug, Clone, Copy)]
 pub enum When {
     /// This option is not given.
@@ -20,18 +20,18 @@ pub enum When {
     IsNot(&'static str, &'static str),
 }
 
-/// Options of a command that are without effect when all of `when` is so.
+/// Options of a command that have no effect when all conditions of `when` hold.
 #[derive(Debug)]
 pub struct Idle {
     /// The command, its words separated by blanks.
     pub command: &'static str,
-    /// The options, by `clap`'s names for them.
+    /// The options, by their `clap` ids.
     pub options: &'static [&'static str],
-    /// When.
+    /// The conditions.
     pub when: &'static [When],
 }
 
-/// Whether somebody gave the option: on the command line, or else in the environment.
+/// Whether the option was given on the command line or in the environment.
 fn is_given(matches: &ArgMatches, id: &str) -> bool {
     matches.value_source(id).is_some_and(|source| source != ValueSource::DefaultValue)
 }
@@ -43,7 +43,7 @@ fn value(matches: &ArgMatches, id: &str) -> Option<String> {
 }
 
 impl When {
-    /// The option that it is about.
+    /// The option that the condition is about.
     fn option(&self) -> &'static str {
         match self {
             When::Without(id) | When::With(id) | When::Is(id, _) | When::IsNot(id, _) => id,
@@ -61,7 +61,7 @@ impl When {
         }
     }
 
-    /// As the message has it.
+    /// The condition as text for the message.
     fn text(&self, command: &Command, matches: &ArgMatches) -> String {
         let option = typed(command, self.option());
         match self {
@@ -74,7 +74,7 @@ impl When {
     }
 }
 
-/// An option as it is typed.
+/// An option as it is typed on the command line.
 fn typed(command: &Command, id: &str) -> String {
     let argument = command.get_arguments().find(|a| a.get_id() == id);
     match argument.and_then(clap::Arg::get_long) {
@@ -83,13 +83,14 @@ fn typed(command: &Command, id: &str) -> String {
     }
 }
 
-/// The command of some words below another one, where this program has it.
+/// The subcommand of `command` that `words` name, if this program has it.
 fn below<'c>(command: &'c Command, words: &str) -> Option<&'c Command> {
     words.split(' ').try_fold(command, |command, word| command.find_subcommand(word))
 }
 
 impl Idle {
-    /// The message, where an option was typed that is without effect. One from the environment stands there for other commands.
+    /// The message, if an option without effect was typed. An option from the environment is accepted: it may be meant for other
+    /// commands.
     fn refusal(&self, root: &Command, matches: &ArgMatches) -> Option<String> {
         let command = below(root, self.command)?;
         let matches = self.command.split(' ').try_fold(matches, |m, word| m.subcommand_matches(word))?;
@@ -102,7 +103,8 @@ impl Idle {
         Some(format!("{} has no effect {}", typed(command, option), when.join(" ")))
     }
 
-    /// The first name that is none of an option of the command, or the command's where there is no such; for tests of the tables.
+    /// The first name that is not an option of the command, or the command's name if there is no such command; for tests of the
+    /// tables.
     pub fn unknown(&self, root: &Command) -> Option<String> {
         let Some(command) = below(root, self.command) else { return Some(self.command.to_owned()) };
         let known = |id: &str| command.get_arguments().any(|a| a.get_id() == id);
@@ -111,7 +113,7 @@ impl Idle {
     }
 }
 
-/// An error for the first option that would be without effect.
+/// An error for the first option that would have no effect.
 ///
 /// # Errors
 /// `clap`'s, of the kind of conflicting options.

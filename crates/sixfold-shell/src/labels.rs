@@ -1,5 +1,5 @@
-//! Texts at things in an image, none over another: greedy placement, each label at the nearest free place (the first step of
-//! J. Christensen, J. Marks and S. Shieber, "An empirical study of algorithms for point-feature label placement", 1995).
+//! Text labels of objects in an image that do not overlap: greedy placement, each label at the nearest free place (the first
+//! step of J. Christensen, J. Marks and S. Shieber, "An empirical study of algorithms for point-feature label placement", 1995).
 
 use sixfold_geometry::RgbImage;
 use sixfold_plot::text_dots;
@@ -10,33 +10,33 @@ const CHARACTER: usize = 6;
 const ROWS: usize = 8;
 /// See [`CHARACTER`].
 const BORDER: usize = 1;
-/// An image so many pixels wide has dots of one pixel; a dot of wider ones is larger.
+/// Up to twice this width in pixels, an image has dots of one pixel; dots grow with the width.
 const WIDTH_OF_A_DOT: usize = 640;
 /// Free places are searched on every n-th column and row, in dots.
 const STEP: usize = 4;
-/// A label that lies further than so many dots from what it names gets a line to it.
+/// A label further than this many dots from its object gets a line to it.
 const NEAR: f64 = 6.0;
-/// Ground of the label of something uncertain; its text has the colour.
+/// Background of an uncertain object's label, whose text has the object's colour.
 const DARK: [u8; 3] = [24; 3];
 
 /// A rectangle in pixels: left, top, right, bottom.
 pub(crate) type Corners = [f64; 4];
 
-/// A text and what it names.
+/// A label and the object that it names.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Label {
     /// A line of ASCII.
     pub text: String,
-    /// Where the thing is that it names.
+    /// The box of the object that it names.
     pub of: Corners,
-    /// The colour of that thing.
+    /// The object's colour.
     pub color: [u8; 3],
-    /// Black on its colour; otherwise its colour on black.
+    /// Whether the text is black on the object's colour; otherwise it has the object's colour on black.
     pub is_sure: bool,
 }
 
 impl Label {
-    /// The text at a given size of dots, cut at its front to fit `width` pixels: the number stands at its end.
+    /// The text at a given size of dots, shortened at its start to fit `width` pixels, because the number is at its end.
     fn fitting(&self, dot: usize, width: usize) -> String {
         let most = (width / dot).saturating_sub(2 * BORDER) / CHARACTER;
         let count = self.text.chars().count();
@@ -51,7 +51,7 @@ fn overlap([ax, ay, aw, ah]: Place, [bx, by, bw, bh]: Place) -> bool {
     ax < bx + bw && bx < ax + aw && ay < by + bh && by < ay + ah
 }
 
-/// Squared distance between the centre of a place and the middle of the upper edge of what it names, where a label is looked for
+/// Squared distance between the centre of a place and the middle of the upper edge of the object's box, where a place is tried
 /// first.
 fn distance([left, top, width, height]: Place, of: &Corners) -> f64 {
     let x = left as f64 + 0.5 * width as f64 - 0.5 * (of[0] + of[2]);
@@ -59,7 +59,7 @@ fn distance([left, top, width, height]: Place, of: &Corners) -> f64 {
     x * x + y * y
 }
 
-/// Where each label goes, in their order; none where the image has no room left.
+/// The place of each label, in order; `None` where the image has no room left.
 fn places(labels: &[Label], size: (usize, usize), dot: usize) -> Vec<Option<Place>> {
     let mut taken: Vec<Place> = vec![];
     labels
@@ -68,7 +68,7 @@ fn places(labels: &[Label], size: (usize, usize), dot: usize) -> Vec<Option<Plac
             let columns = CHARACTER * label.fitting(dot, size.0).chars().count() + 2 * BORDER;
             let (width, height) = (columns * dot, (ROWS + 2 * BORDER) * dot);
             let (last_x, last_y) = (size.0.checked_sub(width)?, size.1.checked_sub(height)?);
-            // The wanted place, then every other one, the nearest first.
+            // The preferred place, then all others, the nearest first.
             let within = |v: f64, last: usize| v.clamp(0.0, last as f64) as usize;
             let wanted = [
                 within(0.5 * (label.of[0] + label.of[2] - width as f64), last_x),
@@ -78,7 +78,7 @@ fn places(labels: &[Label], size: (usize, usize), dot: usize) -> Vec<Option<Plac
             ];
             let free = |place: &Place| !taken.iter().any(|t| overlap(*t, *place));
             let step = STEP * dot;
-            // The last row and column too, or narrow images have no room.
+            // Include the last row and column; otherwise narrow images have no room.
             let grid = move |last: usize| (0..=last).step_by(step).chain([last]);
             let all = || grid(last_y).flat_map(move |y| grid(last_x).map(move |x| [x, y, width, height]));
             let place = if free(&wanted) {
@@ -94,8 +94,8 @@ fn places(labels: &[Label], size: (usize, usize), dot: usize) -> Vec<Option<Plac
         .collect()
 }
 
-/// Writes labels into an image: the first ones nearest to what they name, none over another, each within the image, with a line
-/// where one had to move away. What finds no room is left out.
+/// Draws labels into an image: within the image, without overlaps, the first ones nearest to their objects, with a line where a
+/// label had to move away. A label without room is left out.
 pub(crate) fn draw_labels(image: &mut RgbImage, labels: &[Label]) {
     let dot = (image.width() / WIDTH_OF_A_DOT).max(1);
     let places = places(labels, image.size(), dot);
@@ -108,7 +108,7 @@ pub(crate) fn draw_labels(image: &mut RgbImage, labels: &[Label]) {
     }
 }
 
-/// The line from a label to the centre of what it names, where it lies away from that.
+/// The line from a label to the centre of its object, for a label that is not near it.
 fn leader(image: &mut RgbImage, label: &Label, [left, top, width, height]: Place, dot: usize) {
     let [l, t, r, b] = label.of;
     let centre = [0.5 * (l + r), 0.5 * (t + b)];
@@ -146,7 +146,7 @@ mod tests {
         Label { text: text.into(), of, color: [200, 100, 50], is_sure: true }
     }
 
-    /// Ten things on the same spot, in a corner and beyond the border.
+    /// Ten objects at the same place, in a corner and beyond the border.
     #[test]
     fn labels_neither_cover_each_other_nor_leave_the_image() {
         for of in [[50.0, 40.0, 60.0, 50.0], [0.0, 0.0, 5.0, 5.0], [-80.0, 300.0, -60.0, 310.0]] {
@@ -191,7 +191,7 @@ mod tests {
         draw_labels(&mut other, &[Label { is_sure: false, ..sure.clone() }]);
         assert_eq!(other[(61, 50)], DARK);
         assert!(other.as_slice().contains(&sure.color));
-        // Twenty labels of one thing: the last ones lie away from it, and more than the labels is drawn.
+        // Twenty labels of one object: the last ones are away from it, so lines are drawn too.
         let mut full = RgbImage::filled(160, 120, [255; 3]);
         let labels = vec![label("8 0.90", [0.0, 0.0, 4.0, 4.0]); 20];
         draw_labels(&mut full, &labels);

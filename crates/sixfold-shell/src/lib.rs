@@ -1,9 +1,9 @@
-//! What the programs `sixfold` and `sixfold-experiments` share: exit status and errors, output and progress, images, and the
-//! arguments, stores and scenes that both take.
+//! The parts that the programs `sixfold` and `sixfold-experiments` share: exit status and errors, output and progress,
+//! images, and the arguments, stores and scenes that both take.
 
 #![warn(unreachable_pub, unnameable_types)]
 
-// First: its macros take the place of the standard ones in all that follows.
+// This module comes first: its macros replace the standard ones in all modules that follow.
 #[macro_use]
 pub mod screen;
 
@@ -37,23 +37,23 @@ pub mod training;
 use std::num::NonZeroUsize;
 use std::process::ExitCode;
 
-/// Why a program built without the feature `networks` does not do what was asked for.
+/// The error message of a program built without the feature `networks`.
 pub const WITHOUT_NETWORKS: &str =
     "this program was built without the feature networks: cargo install --path crates/sixfold-cli";
 
-/// What a command that went through tells the shell.
+/// The exit status of a command that ran without an error.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Outcome {
     /// Exit status 0.
     Found,
-    /// Exit status 1: everything worked, but there was nothing.
+    /// Exit status 1: everything worked, but nothing was found.
     NothingFound,
     /// Exit status 2, after the reasons were already printed: part of a batch was skipped.
     Incomplete,
 }
 
-/// The exit status of a command; the reason of an error goes to standard error, and as JSON to standard output where that was
-/// asked for.
+/// The exit status of a command. The reason of an error goes to standard error and, if JSON was requested, as JSON to
+/// standard output.
 pub fn exit_code(result: &anyhow::Result<Outcome>) -> ExitCode {
     screen::finish(match result {
         Ok(Outcome::Found) => 0,
@@ -100,7 +100,7 @@ impl PixelLimit {
     }
 }
 
-/// Uses so many threads for everything, or all cores.
+/// Uses this number of threads for everything, or all cores.
 pub fn use_threads(threads: Option<NonZeroUsize>) {
     if let Some(threads) = threads {
         // Fails only when a pool exists already, and none does.

@@ -1,4 +1,4 @@
-//! The options by which every command reads meshes.
+//! The options with which every command reads meshes.
 
 use clap::Args;
 use sixfold_mesh::MeshOptions;
@@ -12,7 +12,7 @@ pub struct MeshArguments {
 }
 
 impl MeshArguments {
-    /// Makes them the rule for the rest of the program.
+    /// Applies the options to the whole process.
     pub fn apply(self) {
         if self.allow_outside {
             MeshOptions::allow_outside_everywhere();

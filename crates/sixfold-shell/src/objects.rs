@@ -9,7 +9,7 @@ use sixfold_mesh::{Mesh, ModelInfo, Unit};
 /// A mesh under a name.
 #[derive(Debug)]
 pub struct MeshObject {
-    /// What people call it.
+    /// Its name for people.
     pub name: String,
     /// Its surface, metres.
     pub mesh: Mesh,

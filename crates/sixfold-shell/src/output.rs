@@ -33,7 +33,7 @@ pub fn pose_rows(pose: &Pose) -> [[f64; 4]; 4] {
     std::array::from_fn(|i| std::array::from_fn(|j| m[(i, j)]))
 }
 
-/// Prints JSON or calls `table`, and writes the JSON file if one was asked for.
+/// Prints JSON or calls `table`, and writes the JSON file if one was requested.
 pub fn report(json: &JsonArguments, value: &impl Serialize, table: impl FnOnce()) -> Result<()> {
     let text = serde_json::to_string_pretty(value).context("cannot write the result as JSON")?;
     if let Some(path) = json.file() {
@@ -47,10 +47,11 @@ pub fn report(json: &JsonArguments, value: &impl Serialize, table: impl FnOnce()
     Ok(())
 }
 
-/// Writes a file so that no reader sees half of it ([`sixfold_io::write_atomically`]), with the file's name in the error.
+/// Writes a file so that no process reads half of it ([`sixfold_io::write_atomically`]), with the file's name in the
+/// error.
 ///
 /// # Errors
-/// What the system says.
+/// The system's error.
 pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<()> {
     sixfold_io::write_atomically(path, bytes).with_context(|| format!("cannot write {}", path.display()))
 }

@@ -1,4 +1,4 @@
-//! Images of poses: the object's silhouette, tinted surface, axes, name and confidence over the image. What is uncertain has a
+//! Images of poses: the object's silhouette, tinted surface, axes, name and confidence over the image. Uncertain poses have a
 //! thin, dashed outline and a dark label.
 
 use sixfold_bop::{Detection, Rle};
@@ -9,7 +9,7 @@ use sixfold_render::{RenderOptions, SceneObject, VisibilityBuffer};
 
 use crate::labels::{Corners, Label, draw_labels};
 
-/// Colours that differ on screens and for most eyes (Okabe and Ito 2008).
+/// Colours that most people, including colour-blind ones, can distinguish (Okabe and Ito 2008).
 const COLORS: [[u8; 3]; 8] = [
     [230, 159, 0],
     [86, 180, 233],
@@ -60,21 +60,22 @@ pub fn side_by_side(left: &DepthImage, right: &DepthImage) -> RgbImage {
     picture
 }
 
-/// Below this an estimate looks uncertain.
+/// Below this confidence an estimate is drawn as uncertain.
 const SURE: f64 = 0.5;
 /// Pixels of a dash with its gap.
 const DASH: f64 = 12.0;
-/// Width of an outline, pixels: of what is sure and of what is not.
+/// Width of an outline, pixels: of certain and of uncertain poses.
 const OUTLINE: [usize; 2] = [2, 1];
-/// How much of a surface's own colour covers the image: of what is sure and of what is not.
+/// Opacity of the surface's colour over the image: of certain and of uncertain poses.
 const TINT: [f32; 2] = [0.45, 0.2];
 
-/// The number that overlays show for an estimate, 0 to 1: its probability, or its confidence where the method knows none.
+/// The number that overlays show for an estimate, 0 to 1: its probability, or its confidence where the method computes no
+/// probability.
 pub fn certainty(estimate: &PoseEstimate) -> f64 {
     estimate.probability.unwrap_or(estimate.confidence)
 }
 
-/// Where an object is seen.
+/// The shape of an object in an image.
 #[derive(Debug, Clone, Copy)]
 pub enum Shape<'a> {
     /// A mesh in metres at a pose camera_from_object.
@@ -86,11 +87,11 @@ pub enum Shape<'a> {
 /// One pose to be drawn.
 #[derive(Debug, Clone)]
 pub struct Drawn<'a> {
-    /// Where it is.
+    /// Its shape in the image.
     pub shape: Shape<'a>,
-    /// Of its surface, silhouette and label.
+    /// Colour of its surface, silhouette and label.
     pub color: [u8; 3],
-    /// What its label calls it.
+    /// Its name on the label.
     pub name: String,
     /// The number of its label, 0 to 1 ([`certainty`]).
     pub certainty: f64,
@@ -116,7 +117,7 @@ impl<'a> Drawn<'a> {
     }
 }
 
-/// What labels call an object that has a number alone.
+/// The name on labels for an object that has only a number.
 fn object_name(obj_id: u32) -> String {
     format!("obj {obj_id}")
 }
@@ -131,7 +132,7 @@ pub fn caption(name: &str, certainty: f64) -> String {
 pub fn draw(image: &RgbImage, camera: &Camera, poses: &[Drawn<'_>]) -> RgbImage {
     let mut out = image.clone();
     let mut frame = VisibilityBuffer::new(camera);
-    // Far ones first, so that what is in front is drawn last; masks before all.
+    // Far objects first, so that near ones are drawn over them; masks before all others.
     let depth = |d: &Drawn<'_>| match d.shape {
         Shape::Mesh(_, pose) => pose.translation().z,
         Shape::Pixels(_) => f64::INFINITY,
@@ -161,10 +162,10 @@ pub fn draw(image: &RgbImage, camera: &Camera, poses: &[Drawn<'_>]) -> RgbImage 
                 mask
             }
         };
-        // What lies outside the image has no label.
+        // An object outside the image has no label.
         labels.extend(corners(&mask).map(|of| (pose.certainty, pose.label(of))));
     }
-    // The surest ones find their place first.
+    // The most certain labels are placed first.
     labels.sort_by(|a, b| b.0.total_cmp(&a.0));
     let labels: Vec<Label> = labels.into_iter().map(|l| l.1).collect();
     draw_labels(&mut out, &labels);
@@ -181,14 +182,14 @@ fn corners(mask: &Mask) -> Option<Corners> {
     (low[0] <= high[0]).then(|| [low[0] as f64, low[1] as f64, (high[0] + 1) as f64, (high[1] + 1) as f64])
 }
 
-/// Tints the pixels of a mask and draws its outline: whole for what is sure, thin and dashed for what is not.
+/// Tints the pixels of a mask and draws its outline: solid for certain poses, thin and dashed for uncertain ones.
 fn surface(image: &mut RgbImage, mask: &Mask, pose: &Drawn<'_>, shade: impl Fn(usize, usize) -> f32) {
     let Some([left, top, right, bottom]) = corners(mask) else { return };
     let sure = usize::from(!pose.is_sure());
     let (width, tint) = (OUTLINE[sure] as isize, TINT[sure]);
     let inside =
         |x: isize, y: isize| x >= 0 && y >= 0 && mask.get(x as usize, y as usize).copied().unwrap_or(false);
-    // Dashes are sectors of the box's centre, about as long on its circumference as they should be on the outline.
+    // Dashes are angular sectors about the box's centre, sized to give about the wanted length along the outline.
     let middle = [0.5 * (left + right), 0.5 * (top + bottom)];
     let dashes = (2.0 * (right - left + bottom - top) / DASH).round().max(4.0);
     let is_gap = |x: usize, y: usize| {
@@ -231,7 +232,7 @@ fn axes(image: &mut RgbImage, camera: &Camera, mesh: &Mesh, camera_from_object: 
 }
 
 /// A line of two pixels' width.
-/// A line between two pixels; what lies outside the image is left out.
+/// A line between two pixels, clipped to the image.
 pub fn line(image: &mut RgbImage, a: [f64; 2], b: [f64; 2], color: [u8; 3]) {
     let steps = (b[0] - a[0]).abs().max((b[1] - a[1]).abs()).ceil().clamp(1.0, 4000.0);
     for i in 0..=steps as usize {
@@ -263,7 +264,7 @@ fn rectangle(image: &mut RgbImage, [left, top, right, bottom]: Corners, color: [
     }
 }
 
-/// A small text on a coloured ground whose lower left corner is at a point, kept within the image.
+/// A small text on a coloured background with its lower left corner at a point, moved to stay within the image.
 pub fn label(image: &mut RgbImage, [x, y]: [f64; 2], text: &str, color: [u8; 3]) {
     let middle = x + 0.5 * (6 * text.chars().count() + 2) as f64;
     let label = Label { text: text.into(), of: [middle, y, middle, y], color, is_sure: true };
@@ -315,7 +316,7 @@ pub fn normal_picture(normals: &Image<[f32; 3]>) -> RgbImage {
     )
 }
 
-/// Normalised object coordinates as an image: -1..1 to 0..255 per axis; black where nothing is seen.
+/// Normalised object coordinates as an image: -1..1 to 0..255 per axis; black where there is no object.
 pub fn coordinate_picture(coordinates: &Image<[f32; 3]>) -> RgbImage {
     coordinates
         .map(|c| if c[0].is_nan() { [0; 3] } else { c.map(|v| (127.5 * (v + 1.0)).clamp(0.0, 255.0) as u8) })
@@ -371,13 +372,13 @@ mod tests {
         let mesh = square();
         let image = RgbImage::filled(160, 120, [0; 3]);
         let one = draw(&image, &camera(), &[drawn(&mesh, 0.0, 0.9)]);
-        // Eight characters with a border, above the square: the letters are black on the label's ground.
+        // Eight characters with a border, above the square: the letters are black on the label's background.
         let ground = (30..38).flat_map(|y| (55..104).map(move |x| (x, y))).filter(|at| one[*at] == COLOR);
         assert!(ground.count() > 150);
         let two = [drawn(&mesh, 0.0, 0.9), drawn(&mesh, 0.002, 0.8)];
         let both = draw(&image, &camera(), &two);
         assert!(count(&both, COLOR) > count(&one, COLOR) + 200);
-        // Out of the image there is nothing to be named.
+        // Outside the image there is no label.
         assert_eq!(draw(&image, &camera(), &[drawn(&mesh, 5.0, 0.9)]), image);
     }
 
@@ -413,7 +414,7 @@ mod tests {
         assert!((15..40).contains(&side(0.4)), "{}", side(0.4));
         let both = detections_over(&image, &[detection(0.6), detection(0.4)]);
         let one = detections_over(&image, &[detection(0.6)]);
-        // The second label of the same box stands beside the first one.
+        // The second label of the same box is placed beside the first one.
         assert!(count(&both, [0; 3]) + 400 < count(&one, [0; 3]));
     }
 }

@@ -1,4 +1,5 @@
-//! Images for people beside results: written after them, and one that cannot be written costs none of them.
+//! Images that illustrate results. They are written after the results, and an image that cannot be written
+//! does not affect them.
 
 use std::path::{Path, PathBuf};
 
@@ -21,17 +22,17 @@ impl Pictures {
         Pictures { folder, failed: vec![] }
     }
 
-    /// Writes a colour image; its path, if it is there.
+    /// Writes a colour image; returns its path if it was written.
     pub fn write(&mut self, name: &str, image: &RgbImage) -> Option<PathBuf> {
         self.with(name, |path| write_rgb(path, image))
     }
 
-    /// Writes a mask; its path, if it is there.
+    /// Writes a mask; returns its path if it was written.
     pub fn write_mask(&mut self, name: &str, mask: &Mask) -> Option<PathBuf> {
         self.with(name, |path| write_mask(path, mask))
     }
 
-    /// Has a file of the folder written; its path, if it is there.
+    /// Lets a closure write a file of the folder; returns its path if it was written.
     pub fn with<E: Into<anyhow::Error>>(
         &mut self,
         name: &str,
@@ -42,19 +43,19 @@ impl Pictures {
         path.map_err(|error| self.failed.push(crate::describe(&error))).ok()
     }
 
-    /// Takes note of an image that somebody else wrote, or could not; whether it is there.
+    /// Records the result of writing an image elsewhere; returns whether it was written.
     pub fn did<E: Into<anyhow::Error>>(&mut self, written: Result<(), E>) -> bool {
         let is_there = written.is_ok();
         self.failed.extend(written.err().map(|error| crate::describe(&error.into())));
         is_there
     }
 
-    /// What could not be written, a sentence each; nothing is left of it here.
+    /// Takes the messages about images that could not be written, one sentence each.
     pub fn take_failed(&mut self) -> Vec<String> {
         std::mem::take(&mut self.failed)
     }
 
-    /// Reports what could not be written; the outcome is then incomplete.
+    /// Reports images that could not be written; the outcome is then incomplete.
     pub fn outcome(mut self, outcome: Outcome) -> Outcome {
         let failed = self.take_failed();
         failed.iter().for_each(|text| eprintln!("skipped {text}"));

@@ -10,11 +10,11 @@ use indicatif::{ProgressBar, ProgressStyle};
 use crate::screen::{self, Failure, printable};
 
 static INTERRUPTED: AtomicBool = AtomicBool::new(false);
-/// Whether the command looks at [`INTERRUPTED`]: it has something to finish or to keep.
+/// Whether the command checks [`INTERRUPTED`], because it has something to finish or to keep.
 static LOOKED_AT: AtomicBool = AtomicBool::new(false);
 
-/// The first interrupt asks a command that looks for it to stop at the next whole step, and ends any other at once: such a
-/// command writes nothing before its end, or whole files only. The second interrupt ends both.
+/// The first interrupt asks a command that checks for interrupts to stop after its current step. It ends any other command
+/// at once, since those write nothing before their end, or only whole files. The second interrupt ends every command.
 pub fn catch_interrupts() {
     // Without a handler an interrupt ends the program at once, which loses nothing that is on disk.
     let _ = ctrlc::set_handler(|| {
@@ -28,13 +28,13 @@ pub fn catch_interrupts() {
     });
 }
 
-/// Set once the user has asked to stop, for jobs that look at it themselves.
+/// Set once the user has asked to stop, for jobs that check it themselves.
 pub fn interrupted() -> &'static AtomicBool {
     LOOKED_AT.store(true, Ordering::SeqCst);
     &INTERRUPTED
 }
 
-/// Whether the user has asked to stop, for who does not stop for it.
+/// Whether the user has asked to stop, for code that does not stop itself.
 pub(crate) fn was_interrupted() -> bool {
     INTERRUPTED.load(Ordering::SeqCst)
 }
@@ -47,7 +47,7 @@ pub fn check_interrupt(how: &str) -> Result<()> {
     Ok(())
 }
 
-/// A bar on a terminal, a line every ten seconds elsewhere.
+/// A progress bar on a terminal, a line every ten seconds elsewhere.
 pub struct Progress {
     bar: ProgressBar,
     plain: Option<(Instant, &'static str)>,
@@ -73,7 +73,7 @@ impl Progress {
         self.bar.set_message(printable(&message));
     }
 
-    /// What is shown behind the bar.
+    /// Sets the message behind the bar.
     pub fn message(&mut self, message: String) {
         if let Some((last, _)) = &self.plain
             && last.elapsed() < Duration::from_millis(100)
@@ -94,13 +94,13 @@ impl Progress {
         }
     }
 
-    /// Takes the bar away.
+    /// Removes the bar.
     pub fn finish(self) {
         self.bar.finish_and_clear();
     }
 }
 
-/// The bar of a function of a library, from its first report on.
+/// A progress bar for a library function, shown from its first report on.
 pub struct Bar {
     what: &'static str,
     bar: Mutex<Option<Progress>>,
@@ -108,17 +108,17 @@ pub struct Bar {
 }
 
 impl Bar {
-    /// Of a function that an interrupt need not stop, for nothing of it is on the disk yet.
+    /// For a function that an interrupt need not stop, because it has written nothing yet.
     pub fn new(what: &'static str) -> Bar {
         Bar { what, bar: Mutex::new(None), stop: None }
     }
 
-    /// Of a function that an interrupt stops at its next whole part.
+    /// For a function that an interrupt stops after its current part.
     pub fn stopped_by_interrupts(what: &'static str) -> Bar {
         Bar { stop: Some(interrupted()), ..Bar::new(what) }
     }
 
-    /// Takes the bar away.
+    /// Removes the bar.
     pub fn finish(self) {
         if let Ok(Some(bar)) = self.bar.into_inner() {
             bar.finish();

@@ -7,10 +7,10 @@ use std::time::Duration;
 
 use anyhow::{Result, bail};
 
-/// An error for a number outside its range, or that is none.
+/// An error for a number outside its range, or for NaN.
 ///
 /// # Errors
-/// As it says.
+/// For such a number.
 pub fn in_range<T: PartialOrd + Display>(option: &str, value: T, range: RangeInclusive<T>) -> Result<()> {
     if !range.contains(&value) {
         bail!("{option}: found {value}, expected {} to {}", range.start(), range.end());
@@ -18,7 +18,7 @@ pub fn in_range<T: PartialOrd + Display>(option: &str, value: T, range: RangeInc
     Ok(())
 }
 
-/// Most threads: more only cost memory.
+/// Largest number of threads: more only cost memory.
 const MOST_THREADS: usize = 1024;
 
 /// Longest time on the command line, seconds.
@@ -99,7 +99,7 @@ pub fn folder_name(text: &str) -> Result<String, String> {
 /// An error for an id that is named twice.
 ///
 /// # Errors
-/// As it says.
+/// For such an id.
 pub fn without_duplicates(option: &str, ids: &[u32]) -> Result<()> {
     let mut seen = std::collections::BTreeSet::new();
     if let Some(id) = ids.iter().find(|id| !seen.insert(**id)) {

@@ -23,15 +23,15 @@ use sixfold_synth::with_own_color;
 use crate::folder::DatasetFolder;
 use crate::progress::{Progress, check_interrupt};
 
-/// Metres per unit of the depth files: what reaches 6.5 m.
+/// Metres per unit of the depth files, for depths up to 6.5 m.
 pub const DEPTH_SCALE: f64 = 1e-4;
 
-/// An object before it is made ready to fall.
+/// An object before it is prepared for the simulation.
 #[derive(Debug)]
 pub struct NamedModel {
     /// Its id in the dataset.
     pub id: u32,
-    /// What people call it.
+    /// Its name for people.
     pub name: String,
     /// Its surface.
     pub mesh: Mesh,
@@ -47,7 +47,7 @@ impl NamedModels {
     /// The models of a dataset, all or those of `wanted`, with their ids.
     ///
     /// # Errors
-    /// When one is not there, cannot be read, or is another object than `models_info.json` says.
+    /// When a model is missing, cannot be read, or does not match `models_info.json`.
     pub fn of_dataset(dataset: &Path, wanted: &[u32]) -> Result<NamedModels> {
         let folder = dataset.join("models");
         let file = folder.join("models_info.json");
@@ -103,10 +103,11 @@ impl NamedModels {
         Ok(())
     }
 
-    /// Makes them ready to fall: as they are if `exact`, else as their convex hulls. Those without colours get one.
+    /// Prepares them for the simulation: with exact shapes if `exact`, else with their convex hulls. Objects without colours
+    /// get one.
     ///
     /// # Errors
-    /// When one has no parts, or the user interrupts.
+    /// When an object has no convex parts, or the user interrupts.
     pub fn ready(self, exact: bool) -> Result<Vec<FallingObject>> {
         let mut progress = Progress::new("objects", self.0.len());
         let mut objects = vec![];
@@ -131,7 +132,7 @@ impl NamedModels {
 pub struct FallingObject {
     /// Its surface and names.
     pub model: NamedModel,
-    /// What collides.
+    /// Its collision shape.
     pub parts: ConvexParts,
 }
 
@@ -142,7 +143,7 @@ struct Listed<'a> {
     diameter: f64,
 }
 
-/// The camera that sees scenes, without its place: that of a file, or one with 640x480 pixels and the focal length of a Kinect.
+/// The intrinsics of the camera that views scenes: from a file, or 640x480 pixels with the focal length of a Kinect.
 ///
 /// # Errors
 /// For a file that cannot be read, or with lens distortion, which rendered images do not have.
@@ -165,7 +166,7 @@ pub fn pinhole(file: Option<&Path>) -> Result<Camera> {
 /// Writes the models, and a list of their names.
 ///
 /// # Errors
-/// Where another model is there already.
+/// When another model is there already.
 pub fn write_objects(folder: &DatasetFolder, out: &Path, objects: &[FallingObject]) -> Result<()> {
     let models = || objects.iter().map(|o| &o.model);
     folder.write_models(models().map(|m| (m.id, &m.mesh, &m.info)))?;
@@ -174,24 +175,24 @@ pub fn write_objects(folder: &DatasetFolder, out: &Path, objects: &[FallingObjec
     folder.write_once(&out.join("objects.json"), serde_json::to_string_pretty(&list)?.as_bytes())
 }
 
-/// What came of one scene.
+/// The result of one scene.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Made {
     /// Objects that fell.
     pub dropped: usize,
-    /// Those that came to rest within reach.
+    /// Objects that came to rest within reach.
     pub resting: usize,
 }
 
-/// How scenes are made and written.
+/// Makes and writes scenes.
 pub struct SceneMaker<'a> {
     /// Folder of the dataset, and its split.
     pub dataset: (&'a Path, &'a str),
-    /// What may fall.
+    /// Objects that may be dropped.
     pub objects: &'a [FallingObject],
-    /// How it falls, and where cameras are.
+    /// How objects are dropped, and where cameras are.
     pub tabletop: TabletopOptions,
-    /// The camera without its place.
+    /// The camera's intrinsics.
     pub camera: Camera,
     /// Noise of the depth camera.
     pub sensor: Option<DepthSensor>,
@@ -204,7 +205,8 @@ pub struct SceneMaker<'a> {
 }
 
 impl SceneMaker<'_> {
-    /// Drops the objects, renders all views and writes the scene's folder. A function of the options and the scene's id.
+    /// Drops the objects, renders all views and writes the scene's folder. The result depends only on the options and the
+    /// scene's id.
     ///
     /// # Errors
     /// When it cannot be written, or the user interrupts.
@@ -221,7 +223,7 @@ impl SceneMaker<'_> {
         Ok(Made { dropped: scene.dropped, resting: scene.resting.len() })
     }
 
-    /// Makes scenes, several at a time; what came of all of them.
+    /// Makes scenes, several at a time; returns the sum of their results.
     ///
     /// # Errors
     /// When one cannot be written, or the user interrupts.
@@ -242,7 +244,7 @@ impl SceneMaker<'_> {
         Ok(made)
     }
 
-    /// Whether a scene is there: the text file that is written last stands for all of it.
+    /// Whether a scene is complete: the text file that is written last exists.
     pub fn is_whole(&self, scene_id: u32) -> bool {
         self.dataset.0.join(self.dataset.1).join(format!("{scene_id:06}/scene_gt_info.json")).exists()
     }
@@ -282,8 +284,8 @@ impl SceneMaker<'_> {
     }
 }
 
-/// Which pixels show which object is known exactly here, so it need not be guessed from the noisy depth as in real
-/// datasets; only how many pixels were measured comes from that.
+/// In rendered images the pixels of each object are known exactly and need not be estimated from noisy depth as in real
+/// datasets; only the number of measured pixels comes from the depth image.
 fn visibility(posed: &[(&Mesh, Pose)], camera: &Camera, depth: &DepthImage) -> Vec<ObjectVisibility> {
     let mut visible = ground_truth_visibility(posed, camera, None, VISIBILITY_DELTA);
     for object in &mut visible {
@@ -293,7 +295,7 @@ fn visibility(posed: &[(&Mesh, Pose)], camera: &Camera, depth: &DepthImage) -> V
     visible
 }
 
-/// What a dataset holds.
+/// Size of a dataset.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Counts {
     /// Images.
@@ -305,7 +307,7 @@ pub struct Counts {
 }
 
 impl Counts {
-    /// Of all scenes of a dataset.
+    /// Counts over all scenes of a dataset.
     ///
     /// # Errors
     /// When a scene cannot be read.

@@ -1,8 +1,8 @@
-//! What the programs print, all of it at this one place. Control characters of names and messages that were read from files never
-//! reach a terminal, nor does the password in a server's address, wherever on the command line it was given, and a result that could
-//! not be printed never passes for printed.
+//! All output of the programs goes through this module. Control characters of names and messages that were read from files never
+//! reach a terminal, nor does the password in a server's address, wherever on the command line it was given. A result that could
+//! not be printed is reported as an error.
 //!
-//! The macros have the names of the standard ones and take their place: no line of the programs can go around them.
+//! The macros have the names of the standard ones and replace them, so that no line of the programs bypasses them.
 
 use std::borrow::Cow;
 use std::collections::BTreeSet;
@@ -40,7 +40,7 @@ macro_rules! eprintln {
 
 /// Whether anything went to standard output.
 static PRINTED: AtomicBool = AtomicBool::new(false);
-/// The first thing that could not be written there.
+/// The first error of writing to standard output.
 static FAILED: Mutex<Option<io::Error>> = Mutex::new(None);
 
 /// What the macros call for standard output. A failure is kept for the end of the program.
@@ -49,15 +49,15 @@ pub fn out(text: fmt::Arguments<'_>) {
     kept(io::stdout().write_all(printable(&text.to_string()).as_bytes()));
 }
 
-/// What the macros call for standard error. There is nowhere to report that it cannot be written.
+/// What the macros call for standard error. A failure to write there cannot be reported anywhere.
 pub fn err(text: fmt::Arguments<'_>) {
     if let Err(error) = io::stderr().write_all(printable(&text.to_string()).as_bytes()) {
         end_with_the_reader(&error);
     }
 }
 
-/// Ends the program when nobody reads its output any more (`sixfold ... | head`), as the signal would end one in C. What a
-/// command has to keep it writes to files.
+/// Ends the program when nobody reads its output any more (`sixfold ... | head`), as the signal would end a C program. Commands
+/// write what must be kept to files.
 fn end_with_the_reader(error: &io::Error) {
     if error.kind() == io::ErrorKind::BrokenPipe {
         // 128 and the number of SIGPIPE.
@@ -74,7 +74,7 @@ fn kept(result: io::Result<()>) {
 }
 
 /// The text with control characters and those that reverse the direction of writing as JSON escapes (`\u001b`), so that texts of
-/// files cannot move the cursor, clear the screen or pass for another name. Line ends and tabs stay. JSON remains the same JSON.
+/// files cannot move the cursor, clear the screen or imitate another name. Line ends and tabs stay. JSON remains the same JSON.
 pub fn plain(text: &str) -> Cow<'_, str> {
     let harmful = |c: char| {
         (c.is_control() && !matches!(c, '\n' | '\t'))
@@ -94,12 +94,13 @@ pub fn plain(text: &str) -> Cow<'_, str> {
     Cow::Owned(safe)
 }
 
-/// What can be printed of a text: [`plain`], and the addresses of servers that are among the program's arguments without passwords.
+/// A text made safe to print: as [`plain`], and with the passwords removed from server addresses that are among the program's
+/// arguments.
 pub(crate) fn printable(text: &str) -> String {
     plain(&without_addresses(text, addresses())).into_owned()
 }
 
-/// An address of a server that stands on the command line, where it belongs or not, and what of it can be shown.
+/// A server address given anywhere on the command line, and its form without a password.
 #[derive(Debug, PartialEq)]
 struct Address {
     given: String,
@@ -112,7 +113,7 @@ fn addresses() -> &'static [Address] {
     ADDRESSES.get_or_init(|| addresses_of(std::env::args_os().skip(1)))
 }
 
-/// The addresses among arguments, and among what stands behind their equals signs; the longest first.
+/// The addresses among arguments, and among the values after equals signs; the longest first.
 fn addresses_of(arguments: impl Iterator<Item = OsString>) -> Vec<Address> {
     let mut found = vec![];
     for argument in arguments {
@@ -128,7 +129,7 @@ fn addresses_of(arguments: impl Iterator<Item = OsString>) -> Vec<Address> {
     found
 }
 
-/// What can be shown of the address of a server; `None` for what is no address.
+/// The address of a server without its password; `None` for text that is not an address.
 #[cfg(feature = "experience")]
 fn shown_address(text: &str) -> Option<String> {
     match sixfold_experience::StorePlace::from(text) {
@@ -143,7 +144,7 @@ fn shown_address(_: &str) -> Option<String> {
     None
 }
 
-/// A text with addresses as they can be shown.
+/// A text with the addresses replaced by their forms without passwords.
 fn without_addresses<'t>(text: &'t str, addresses: &[Address]) -> Cow<'t, str> {
     let mut text = Cow::Borrowed(text);
     for Address { given, shown } in addresses {
@@ -154,8 +155,8 @@ fn without_addresses<'t>(text: &'t str, addresses: &[Address]) -> Cow<'t, str> {
     text
 }
 
-/// A message about the command line without passwords. One that shows a part of an address, such as what stands before a comma,
-/// gives way to `kind`, which names no argument.
+/// A message about the command line without passwords. A message that shows a part of an address, such as the part before a comma,
+/// is replaced by `kind`, which names no argument.
 fn without_passwords(message: &str, kind: &str, addresses: &[Address]) -> String {
     fn words(text: &str) -> impl Iterator<Item = &str> {
         text.split(|c: char| !c.is_alphanumeric()).filter(|word| !word.is_empty())
@@ -172,12 +173,12 @@ fn without_passwords(message: &str, kind: &str, addresses: &[Address]) -> String
     safe.into_owned()
 }
 
-/// What the caller of a program wanted and did not get.
+/// The kind of failure that a program reports to its caller.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Failure {
     /// The command line is wrong.
     Usage,
-    /// The command could not be done.
+    /// The command failed.
     Command,
     /// The user stopped it.
     Interrupt,
@@ -201,7 +202,7 @@ fn fail_as_json(message: &str, failure: Failure) {
     println!("{:#}", json!({ "error": { "kind": kind, "message": message, "exit_status": 2 } }));
 }
 
-/// Whether `--json` asks for JSON on the screen: it has no file behind it. For when arguments could not be parsed.
+/// Whether `--json` requests JSON on the screen, that is, no file follows it. Used when arguments could not be parsed.
 fn json_wanted(arguments: impl Iterator<Item = OsString>) -> bool {
     let arguments: Vec<OsString> = arguments.take_while(|a| a != "--").collect();
     let is_option = |a: &OsString| a.len() > 1 && a.as_encoded_bytes().starts_with(b"-");
@@ -209,8 +210,8 @@ fn json_wanted(arguments: impl Iterator<Item = OsString>) -> bool {
     place.is_some_and(|i| arguments.get(i + 1).is_none_or(is_option))
 }
 
-/// The command line of a program; where it is wrong, or asks for help, all has been printed and the exit status is the error.
-/// Options that would be ignored by `idle` are wrong.
+/// Parses the command line of a program. If it is wrong or requests help, the text has been printed and the error is the exit
+/// status. Options that have no effect according to `idle` are wrong.
 pub fn parse<A: Parser>(idle: &[Idle]) -> Result<A, ExitCode> {
     let mut command = A::command();
     let parsed = command.try_get_matches_from_mut(std::env::args_os()).and_then(|matches| {
@@ -224,7 +225,7 @@ pub fn parse<A: Parser>(idle: &[Idle]) -> Result<A, ExitCode> {
             let kind = error.kind().as_str().unwrap_or("the command line is wrong");
             let text = match addresses() {
                 [] => {
-                    // With colours; there is nowhere to report that it cannot be printed.
+                    // This prints with colours. A failure to print cannot be reported anywhere.
                     drop(error.print());
                     error.render().to_string()
                 }
@@ -280,14 +281,14 @@ mod tests {
         assert!(
             of("grasp propose --depth d.png --camera=c.json --box 1,2,3,4 --experiences a.db").is_empty()
         );
-        // What shows no password is left as it is.
+        // Text without a password is not changed.
         assert!(of("grasp store list postgres://robot@server:5432/fleet").is_empty());
         let address = "postgres://robot:secret@server/fleet";
         let given = of(&format!("grasp learn {address}"));
         let message = format!("error: unexpected argument '{address}' found\n\nUsage: sixfold grasp learn");
         let safe = without_passwords(&message, "unexpected argument found", &given);
         assert_eq!(safe, message.replace(":secret", ""));
-        // The value alone of an option, the whole of an option that is none.
+        // Only the value of an option; the whole argument where the option does not exist.
         let given = of(&format!("--outbox={address} --{address}"));
         for shown in [address.to_owned(), format!("--{address}"), format!("--outbox={address}")] {
             let safe = without_passwords(&format!("found '{shown}', expected none"), "wrong", &given);

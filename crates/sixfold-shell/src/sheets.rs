@@ -14,7 +14,7 @@ const SCENES: usize = 6;
 const VIEWS: usize = 3;
 /// Width of an image of a dataset in pixels.
 const WIDTH: usize = 320;
-/// What lies between images that do not fill their places.
+/// Colour around images that do not fill their cells.
 const EMPTY: [u8; 3] = [24; 3];
 
 /// Puts an image into a larger one.
@@ -26,7 +26,7 @@ fn paste(sheet: &mut RgbImage, image: &RgbImage, left: usize, top: usize) {
     }
 }
 
-/// Images row by row in places of `size` pixels, each with a text.
+/// Images row by row in cells of the given width and height in pixels, each with a text.
 pub fn sheet(rows: &[Vec<(RgbImage, String)>], (width, height): (usize, usize)) -> Option<RgbImage> {
     let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
     if columns == 0 || width == 0 || height == 0 {
@@ -80,7 +80,7 @@ pub fn first_scenes(dataset: &BopDataset) -> Result<Option<RgbImage>> {
     Ok(sheet(&rows, (WIDTH, height)))
 }
 
-/// The image at the sheet's width: each pixel the mean of those it stands for.
+/// The image at the sheet's width: each pixel is the mean of the pixels that it replaces.
 fn smaller(image: &RgbImage) -> RgbImage {
     let (width, height) = image.size();
     let scale = width as f64 / WIDTH as f64;

@@ -1,23 +1,23 @@
-//! Where the weights and samples are that come with Sixfold as files of their own: in a checkout, beside an installed program, or
-//! in the user's data folder (XDG Base Directory Specification 0.8). docs/install.md lists the places.
+//! The location of the weights and samples that come with Sixfold as separate files: in a checkout, beside an installed program,
+//! or in the user's data folder (XDG Base Directory Specification 0.8). docs/install.md lists the places.
 
 use std::path::{Path, PathBuf};
 
 use anyhow::{Result, bail};
 
-/// The variable that names the one folder to look in.
+/// The environment variable that names the only folder to search.
 pub const VARIABLE: &str = "SIXFOLD_SHARE";
 
 /// A file or folder that comes with Sixfold.
 #[derive(Debug, Clone, Copy)]
 pub struct Shipped {
-    /// What it is, for messages.
+    /// Its description, for messages.
     what: &'static str,
     /// Its path in a folder of shipped files.
     name: &'static str,
     /// Its path in a checkout.
     checkout: &'static str,
-    /// A file by which a folder is known to be it; empty for a file.
+    /// A file that identifies the folder; empty for a file.
     sign: &'static str,
     /// The option that names another one.
     option: &'static str,
@@ -38,7 +38,7 @@ pub const PIX2POSE: Shipped = Shipped::weights("weights/pix2pose-lmo.safetensors
 /// Weights of the detector for the samples' objects.
 pub const DETECTOR: Shipped = Shipped::weights("weights/detector-lmo.safetensors", "--detector FILE");
 
-/// The network that grasps from experience are found by.
+/// The network that finds grasps from experience.
 pub const DGCM: Shipped = Shipped::weights("weights/dgcm.safetensors", "--weights FILE");
 
 impl Shipped {
@@ -46,7 +46,7 @@ impl Shipped {
         Shipped { what: "the file of weights", name, checkout: name, sign: "", option }
     }
 
-    /// Where it is.
+    /// Its path.
     ///
     /// # Errors
     ///
@@ -85,7 +85,7 @@ impl Shipped {
         }
     }
 
-    /// Where it may be, the first first. Where the variable names a folder, nothing else counts.
+    /// The possible places, in order of preference. Where the variable names a folder, no other place is used.
     fn candidates(&self, places: &Places) -> Vec<PathBuf> {
         let mut candidates: Vec<PathBuf> = match &places.variable {
             Some(folder) => vec![folder.join(self.name), folder.join(self.checkout)],
@@ -102,10 +102,10 @@ impl Shipped {
     }
 }
 
-/// The folders to look in.
+/// The folders to search.
 #[derive(Debug, Default)]
 struct Places {
-    /// What the variable names.
+    /// The folder that the variable names.
     variable: Option<PathBuf>,
     /// The current folder: it, or one above, may be a checkout.
     here: Option<PathBuf>,

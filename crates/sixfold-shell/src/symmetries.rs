@@ -1,4 +1,4 @@
-//! The symmetries of an object as people and scripts get them: a table, JSON, an image.
+//! Output of an object's symmetries: a table, JSON, an image.
 
 use std::f64::consts::TAU;
 
@@ -12,11 +12,11 @@ use crate::output::pose_rows;
 
 /// Height of the line of text over each image, pixels.
 const CAPTION: usize = 26;
-/// Image pixels of a glyph's pixel.
+/// Image pixels per font pixel.
 const TEXT: f64 = 4.0 / 3.0;
 /// Images in a row.
 const COLUMNS: usize = 4;
-/// The fraction of a full turn by which the image of a continuous symmetry is rotated.
+/// Rotation with which a continuous symmetry is shown, as a fraction of a full turn.
 const SOME_TURN: f64 = 0.3;
 
 /// A symmetry as JSON has it; lengths in metres.
@@ -24,7 +24,7 @@ const SOME_TURN: f64 = 0.3;
 pub struct ListedSymmetry {
     axis: [f64; 3],
     point: [f64; 3],
-    /// Rotations by multiples of a full turn over this; null: all rotations.
+    /// The symmetry holds for multiples of a full turn divided by this number; null: for all rotations.
     order: Option<u32>,
     deviation_p95: f64,
     deviation_max: f64,
@@ -37,7 +37,7 @@ pub struct ListedSymmetry {
 }
 
 impl ListedSymmetry {
-    /// A found one.
+    /// The JSON form of a symmetry that was found.
     pub fn of(s: &FoundSymmetry) -> ListedSymmetry {
         ListedSymmetry {
             axis: s.axis.into(),
@@ -54,7 +54,7 @@ impl ListedSymmetry {
     }
 }
 
-/// A number with some digits, without the sign of a zero.
+/// A number with `digits` digits, without a negative zero.
 fn rounded(number: f64, digits: usize) -> String {
     let text = format!("{number:.digits$}");
     let is_zero = text.bytes().all(|b| b"-0.".contains(&b));
@@ -109,7 +109,7 @@ pub fn table(name: &str, diameter: f64, found: &[FoundSymmetry]) {
     }
 }
 
-/// An image: the object, and rotated by each symmetry.
+/// An image of the object, unchanged and rotated by each symmetry.
 pub fn picture(mesh: &Mesh, found: &[FoundSymmetry]) -> RgbImage {
     let mut images = vec![("as it is".to_owned(), portrait(mesh))];
     for s in found {

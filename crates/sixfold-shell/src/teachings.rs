@@ -1,4 +1,4 @@
-//! What an object is taught from, given as files; and which photographs were of no use.
+//! The inputs from which an object is taught, given as files; and the photographs that were not used.
 
 use std::path::{Path, PathBuf};
 
@@ -16,7 +16,7 @@ use crate::board::{Ends, photograph_files, ruler_in_metres};
 pub struct TeachingFiles<'a> {
     /// Photographs and folders of them; or one JSON file that lists photographs with poses.
     pub photographs: &'a [PathBuf],
-    /// Depth images of the same places and folders of them, in the same order.
+    /// Depth images taken from the same viewpoints, and folders of them, in the same order.
     pub depth: &'a [PathBuf],
     /// Millimetres per unit of the depth images.
     pub depth_scale: Option<f64>,
@@ -28,17 +28,17 @@ pub struct TeachingFiles<'a> {
     pub without_board: bool,
     /// Measured length between the two points of `ends`, metres.
     pub length: Option<f64>,
-    /// Where photographs show its ends.
+    /// The ends of that length in photographs.
     pub ends: &'a [Ends],
     /// A mesh of the object, and its unit.
     pub mesh: Option<(&'a Path, Unit)>,
 }
 
 impl TeachingFiles<'_> {
-    /// The teaching in the folder `out`, with these files in it.
+    /// Opens the teaching in the folder `out` and adds these files.
     ///
     /// # Errors
-    /// For files that cannot be read or do not belong together, by the options of `sixfold teach`.
+    /// For files that cannot be read or do not belong together; messages name the options of `sixfold teach`.
     pub fn open(&self, out: &Path) -> Result<Teaching> {
         match self.photographs {
             [file] if file.extension().is_some_and(|e| e.eq_ignore_ascii_case("json")) => {

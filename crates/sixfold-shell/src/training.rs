@@ -1,4 +1,4 @@
-//! What trainings on the command line have in common: what they learn from, how their progress is shown, and what they report.
+//! The parts that trainings on the command line have in common: their data, the display of progress, and the report.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -55,8 +55,7 @@ pub struct MaterialArguments {
     pub store: PathBuf,
 }
 
-/// The training set that `a` names: all its objects, and the posed instances of which at least the fraction `min_visibility` is
-/// seen.
+/// The training set that `a` names: all its objects, and the posed instances whose visible fraction is at least `min_visibility`.
 ///
 /// # Errors
 /// When nothing is named, or it cannot be read.
@@ -81,7 +80,7 @@ pub fn training_set(a: &MaterialArguments, min_visibility: f64) -> Result<Traini
     Ok(TrainingSet::of_meshes(meshes, &a.objects.join(", ")))
 }
 
-/// With the options that help.
+/// The error with the options that help.
 fn in_words(error: TrainingSetError) -> anyhow::Error {
     match &error {
         TrainingSetError::NoObjects { .. } => anyhow!("{error} with --ids"),
@@ -96,10 +95,10 @@ fn in_words(error: TrainingSetError) -> anyhow::Error {
     }
 }
 
-/// Whether the model in `file` was trained on a frame: scores there are worth nothing.
+/// Whether the model in `file` was trained on a frame, so that scores on this frame are meaningless.
 ///
 /// # Errors
-/// For a card that does not say: no frame can be tested on then.
+/// For a card that does not state this: no frame can then be used for tests.
 pub fn was_trained_on(card: &ModelCard, file: &Path, frame: FrameId) -> Result<bool> {
     card.was_trained_on(frame).with_context(|| {
         format!(
@@ -109,23 +108,23 @@ pub fn was_trained_on(card: &ModelCard, file: &Path, frame: FrameId) -> Result<b
     })
 }
 
-/// What a training came to; `M`: what only some of them say.
+/// The report of a training; `M` holds the fields that only some trainings report.
 #[derive(Serialize)]
 pub struct Summary<M> {
     /// The model's file.
     pub model: String,
     /// Steps of the training.
     pub steps: u64,
-    /// Of training; `None` where a model was only exported.
+    /// Training time in seconds; `None` where a model was only exported.
     pub seconds: Option<f64>,
     /// Losses of the last record, by name.
     pub losses: BTreeMap<String, f64>,
-    /// What only some trainings say.
+    /// Fields that only some trainings report.
     #[serde(flatten)]
     pub more: M,
 }
 
-/// What was learnt from.
+/// The training data.
 #[derive(Serialize)]
 pub struct LearntFrom {
     /// Ids of the objects.
@@ -134,31 +133,31 @@ pub struct LearntFrom {
     pub photographs: usize,
 }
 
-/// How good the model is on objects that it was not trained on.
+/// The quality of the model on objects that it was not trained on.
 #[derive(Serialize)]
 pub struct Measured<Q> {
     /// Its scores.
     pub quality: Q,
 }
 
-/// What is reported of a training.
+/// The report of a training.
 pub fn summary<R, M>(trained: Trained<R>, more: impl FnOnce(R) -> M) -> Summary<M> {
     let Trained { model, steps, seconds, losses, report } = trained;
     Summary { model: model.display().to_string(), steps, seconds, losses, more: more(report) }
 }
 
-/// How a training is shown.
+/// Texts for the display of a training.
 pub struct Shown {
-    /// What is made ready before the first step.
+    /// What is prepared before the first step.
     pub preparing: &'static str,
-    /// What is measured after the last.
+    /// What is measured after the last step.
     pub measuring: &'static str,
-    /// Behind the bar of the steps.
+    /// The message behind the progress bar of the steps.
     pub message: fn(&TrainingRecord) -> String,
 }
 
-/// Trains in `out`, or resumes the training there, or only writes the model of its last checkpoint. `by_flag` says an option out of
-/// its range in the caller's words.
+/// Trains in `out`, or resumes the training there, or only writes the model of its last checkpoint. `by_flag` describes an option
+/// out of its range by the name of its flag.
 ///
 /// # Errors
 /// As the recipe, and when the user interrupts.
@@ -189,7 +188,7 @@ pub fn train_in<R: Recipe>(
     }
 }
 
-/// A bar of what is done at the moment, and notes.
+/// A progress bar of the current activity, and notes.
 struct Bars {
     shown: Shown,
     bar: Option<(&'static str, Progress)>,
@@ -228,12 +227,12 @@ impl Bars {
     }
 }
 
-/// The value of a loss, where the record has it.
+/// The value of a loss in a record; NaN if the record does not have it.
 pub fn loss(record: &TrainingRecord, name: &str) -> f64 {
     record.losses.get(name).copied().unwrap_or(f64::NAN)
 }
 
-/// What the user typed, for the card.
+/// The command line, for the model card.
 pub fn command_line() -> String {
     let words = std::env::args().skip(1).filter(|word| word != "--export");
     std::iter::once("sixfold".to_string()).chain(words).collect::<Vec<_>>().join(" ")

@@ -29,14 +29,14 @@ pub fn randomly_colored(mesh: &Mesh, random: &mut Random) -> Mesh {
             color.map(|c| (c.clamp(0.0, 1.0) * 255.0) as u8)
         })
         .collect();
-    // One colour per vertex always fits. The texture would win over it, so only the shape is kept.
+    // One colour per vertex always fits. A texture would take precedence over it, so only the shape is kept.
     Mesh::new(mesh.vertices().to_vec(), mesh.faces().to_vec())
         .and_then(|shape| shape.with_normals(mesh.vertex_normals()))
         .and_then(|shape| shape.with_colors(colors))
         .unwrap_or_else(|_| mesh.clone())
 }
 
-/// A mesh without colours gets one of its own, which its number decides.
+/// Gives a mesh without colours a single colour, which depends on its number.
 ///
 /// # Errors
 /// [`MeshError`]: never, one colour per vertex always fits.
@@ -45,7 +45,7 @@ pub fn with_own_color(mesh: Mesh, number: u32) -> Result<Mesh, MeshError> {
         return Ok(mesh);
     }
     let mut random = stream(u64::from(number), 2 << 40);
-    // Hues a golden section apart: neighbours in number differ most.
+    // Hues at distances of the golden ratio: consecutive numbers get very different hues.
     let hue = f64::from(number) * 0.618_033_988_749_895;
     let (pale, bright) = (0.15 + 0.5 * random.random::<f64>(), 110.0 + 120.0 * random.random::<f64>());
     let channel = |shift: f64| {

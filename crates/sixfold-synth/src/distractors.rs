@@ -1,7 +1,6 @@
-//! Distractors that look as rendered objects do: cans, cups, bowls, bottles, boxes and what can be put together from them,
-//! in plain colours or printed with textures, lit by the same lamps. Without them a network takes everything that stands on a
-//! table for one of its objects, because in its training nothing else did (as the distractor objects of Hinterstoisser et al.
-//! 2019, made by procedure).
+//! Distractors that look like rendered objects: cans, cups, bowls, bottles, boxes and combinations of them, in plain colours
+//! or with textures, lit by the same lamps. Without them a network takes every object on a table for one of its own, because
+//! its training images show no others (like the distractor objects of Hinterstoisser et al. 2019, but procedural).
 
 use std::f64::consts::{PI, TAU};
 
@@ -18,8 +17,8 @@ const AROUND: u32 = 24;
 /// Side of a texture, pixels.
 const TEXTURE: usize = 96;
 
-/// A random solid about the origin with a bounding box whose longest side is 1. Half of the plain ones have a colour out of
-/// `palette`, where the objects' own belong: colour alone must not tell an object.
+/// A random solid about the origin with a bounding box whose longest side is 1. Half of the plain ones have a colour from
+/// `palette`, which holds the colours of the objects: colour alone must not identify an object.
 pub fn random_solid(textures: &Backgrounds, palette: &[[u8; 3]], random: &mut Random) -> Mesh {
     let parts = if random.random::<f32>() < 0.25 { random.random_range(2..=3u32) } else { 1 };
     let parts: Vec<Mesh> = (0..parts)
@@ -40,7 +39,7 @@ pub fn random_solid(textures: &Backgrounds, palette: &[[u8; 3]], random: &mut Ra
     dressed(shape, &parts, textures, palette, random)
 }
 
-/// A rotation, each as likely as any other (Shoemake 1992).
+/// A uniformly distributed rotation (Shoemake 1992).
 pub fn random_rotation(random: &mut Random) -> Pose {
     let [u, v, w] = [0; 3].map(|_| between(random, 0.0, 1.0));
     let about = |angle: f64, axis: Vec3| {
@@ -95,17 +94,17 @@ fn without_texture(mesh: &Mesh) -> Mesh {
     given(bare.with_normals(mesh.vertex_normals()))
 }
 
-/// What is made here has as many attributes as vertices.
+/// The meshes made here always have as many attributes as vertices.
 fn given<E: std::fmt::Debug>(mesh: Result<Mesh, E>) -> Mesh {
     mesh.unwrap_or_else(|error| unreachable!("a solid of our own making: {error:?}"))
 }
 
-/// Parts as one; all have normals and texture coordinates, which stay because all share a texture.
+/// The parts as one mesh. All have normals and texture coordinates, which are kept because all share a texture.
 fn merged(parts: &[Mesh]) -> Mesh {
     given(Mesh::merged(parts))
 }
 
-/// In place of the texture that comes later.
+/// A placeholder for the texture that is set later.
 fn one_texel() -> RgbImage {
     RgbImage::filled(1, 1, [128; 3])
 }
@@ -135,7 +134,7 @@ fn cuboid(random: &mut Random) -> Mesh {
     given(given(given(Mesh::new(vertices, faces)).with_normals(normals)).with_texture(texcoords, one_texel()))
 }
 
-/// What is rotated about an axis: can, cup, bowl, bottle or pebble; some cups with a handle.
+/// A solid of revolution: can, cup, bowl, bottle or pebble; some cups have a handle.
 fn household(random: &mut Random) -> Mesh {
     let radius = between(random, 0.2, 0.55);
     let wall = 0.04;
@@ -185,8 +184,8 @@ fn household(random: &mut Random) -> Mesh {
     }
 }
 
-/// A profile of (radius, height) from the axis back to the axis, rotated about z. Each band has normals of its own: edges of
-/// cans are sharp.
+/// A profile of (radius, height) from the axis back to the axis, rotated about z. Each band has its own normals, so that
+/// edges, such as those of cans, are sharp.
 fn lathed(profile: &[(f64, f64)]) -> Mesh {
     let (mut vertices, mut normals, mut texcoords, mut faces) = (vec![], vec![], vec![], vec![]);
     let lengths: Vec<f64> = profile.windows(2).map(|w| (w[1].0 - w[0].0).hypot(w[1].1 - w[0].1)).collect();
@@ -216,7 +215,7 @@ fn lathed(profile: &[(f64, f64)]) -> Mesh {
     given(given(given(Mesh::new(vertices, faces)).with_normals(normals)).with_texture(texcoords, one_texel()))
 }
 
-/// Half a ring beside a cup of this radius.
+/// Half a ring at the side of a cup of this radius.
 fn handle(radius: f64, random: &mut Random) -> Mesh {
     const BENDS: u32 = 10;
     const SIDES: u32 = 8;
@@ -252,7 +251,7 @@ mod tests {
     use super::*;
     use sixfold_geometry::random::stream;
 
-    /// Six times the volume that the faces enclose: positive where they look outwards.
+    /// Six times the volume that the faces enclose: positive if they face outwards.
     fn volume(mesh: &Mesh) -> f64 {
         mesh.faces()
             .iter()

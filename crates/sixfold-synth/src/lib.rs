@@ -1,9 +1,9 @@
-//! Everything that is made by a procedure: household objects and toys ([`shapes`]), solids that look as rendered objects do
-//! ([`distractors`]), simple closed shapes of known sizes ([`primitives`]), textures, backgrounds, occluders and image
-//! augmentation ([`augment`]).
+//! Procedural content: household objects and toys ([`shapes`]), solids that look like rendered objects ([`distractors`]),
+//! simple closed shapes of known sizes ([`primitives`]), textures, backgrounds, occluders and image augmentation
+//! ([`augment`]).
 //!
-//! Everything random takes the caller's generator, so that a sample is a function of seed and number alone, whatever thread
-//! draws it. Metres, except where a shape is of size one.
+//! All random functions take the caller's generator, so that a sample depends only on the seed and its number, on any
+//! thread. Lengths are in metres, except for shapes of size one.
 
 #![warn(unreachable_pub, unnameable_types)]
 

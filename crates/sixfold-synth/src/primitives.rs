@@ -1,5 +1,5 @@
-//! Simple closed shapes with known sizes, for tests and for trying out a gripper: boxes and lathed shapes (solids of revolution).
-//! All stand on `z = 0` except the cuboid, which is centred.
+//! Simple closed shapes with known sizes, for tests and for trying a gripper: boxes and lathed shapes (solids of revolution). All
+//! stand on `z = 0`, except the cuboid, which is centred on the origin.
 
 use sixfold_geometry::Vec3;
 use sixfold_mesh::{Mesh, MeshError};
@@ -103,7 +103,7 @@ pub fn bottle(radius: f64, height: f64) -> Result<Mesh, MeshError> {
 pub fn mug(radius: f64, height: f64, wall: f64, handle: f64) -> Result<Mesh, MeshError> {
     let cup = cup(radius, height, wall)?;
     let (reach, span) = (0.55 * radius, 0.6 * height);
-    // Bars begin inside the wall, so that nothing gapes.
+    // Bars begin inside the wall, so that there is no gap.
     let start = radius - 0.5 * wall;
     let place = |mesh: Mesh, x: f64, z: f64| {
         mesh.transformed(&sixfold_geometry::Pose::from_translation(Vec3::new(x, 0.0, z)))
@@ -123,7 +123,7 @@ pub fn mug(radius: f64, height: f64, wall: f64, handle: f64) -> Result<Mesh, Mes
 mod tests {
     use super::*;
 
-    /// Signed volume: positive when the faces look outwards (divergence theorem).
+    /// Signed volume: positive when the faces face outwards (divergence theorem).
     fn volume(mesh: &Mesh) -> f64 {
         (0..mesh.faces().len())
             .map(|f| {

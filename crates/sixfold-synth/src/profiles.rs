@@ -1,5 +1,5 @@
-//! Outlines that shapes are lathed from: (radius, height) points from the axis at the bottom outwards, up, and back
-//! to the axis.
+//! Profiles of lathed shapes: (radius, height) points from the axis at the bottom outwards, up, and back to the
+//! axis.
 
 /// A solid cylinder.
 pub(crate) fn cylinder(radius: f64, height: f64) -> [(f64, f64); 4] {

@@ -1,4 +1,4 @@
-//! The symmetries that members of the families have by the way they are made are found in their meshes.
+//! The symmetries that follow from the construction of a family's members are found in their meshes.
 
 use sixfold_geometry::Vec3;
 use sixfold_geometry::random::stream;
@@ -29,7 +29,7 @@ fn families_have_the_symmetries_of_their_making() {
             }
             for pose in &info.symmetries_discrete {
                 let axis = pose.rotation().axis().unwrap();
-                // Of an even order, or any rotation: a half turn is among them.
+                // An even order, or any rotation, includes a half turn.
                 let holds = |s: &&&FoundSymmetry| {
                     s.order.is_none_or(|n| n.is_multiple_of(2)) && degrees(&s.axis, &axis) < 0.5
                 };

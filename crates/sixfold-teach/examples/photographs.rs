@@ -1,6 +1,6 @@
 //! Writes simulated photographs of a mesh on the board, to try `sixfold teach` and the page Teach without a camera:
 //! `cargo run --release -p sixfold-teach --example photographs -- MESH UNIT OUT [NUMBER [cloth]]`.
-//! With `cloth` it stands on a patterned cloth in place of the board, and the options for `sixfold teach --no-board` are printed.
+//! With `cloth` it stands on a patterned cloth instead of the board, and the options for `sixfold teach --no-board` are printed.
 //!
 //! `OUT/photographs/00.jpg ...` are the photographs, `OUT/camera.json` their camera; `OUT/scene` holds one more photograph with depth, to
 //! find the object in, and `OUT/truth.json` the true poses.
@@ -27,7 +27,7 @@ fn main() -> Result<(), Failure> {
     let camera =
         Camera { fx: 620.0, fy: 618.0, cx: 322.0, cy: 238.0, width: 640, height: 480, distortion: None };
     let options = SimulationOptions { photographs, camera, motion: 0.5, blur: 0.5, ..Default::default() };
-    // One with another step around the object sees it from between the others.
+    // A view with another step around the object is between the others.
     let between = SimulationOptions { photographs: photographs + 1, ..options.clone() };
     let ground = Image::from_fn(64, 64, |x, y| [90 + 30 * ((x / 8 + y / 8) % 2) as u8, 85, 70]);
     let board = Board::new(Paper::A4);
@@ -48,7 +48,7 @@ fn main() -> Result<(), Failure> {
     write_jpeg(&out.join("scene/rgb.jpg"), &scene.photograph(last).ok_or("no such photograph")?)?;
     sixfold_io::write_depth(&out.join("scene/depth.png"), &scene.depth(last).ok_or("no depth")?, 1e-3)?;
     if cloth.is_some() {
-        // Two points of the cloth, to the pixel, as somebody would mark them.
+        // Two points of the cloth, to the pixel, as a person would mark them.
         let pixel = |i: usize, x: f64, y: f64| {
             let p = capture.camera_from_board[i].transform_point(&Vec3::new(x, y, 0.0));
             camera.project(&p).map_or(String::from("-"), |p| format!("{:.0},{:.0}", p.x, p.y))

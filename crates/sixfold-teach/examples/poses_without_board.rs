@@ -1,10 +1,10 @@
-//! How exact camera poses without a board are: photographs put together by their features, held against known poses.
+//! The accuracy of camera poses without a board: photographs are registered by their features and compared with known poses.
 //!
 //! `cargo run --release -p sixfold-teach --example poses_without_board -- simulated MESH UNIT SEED [GROUND.jpg]` renders 20 photographs of a mesh on a
 //! patterned cloth, or on one with a photograph as texture, without giving the camera. `... -- bop DATASET SCENE OBJECT IM_ID,IM_ID,...` takes images of
-//! a dataset with its camera; the object's ground truth says where the camera was.
+//! a dataset with its camera; the object's ground truth gives the camera's poses.
 //!
-//! Both print how many photographs were put together and the errors of the cameras after the similarity that fits their centres best.
+//! Both print how many photographs were registered and the errors of the cameras after the best similarity between their centres.
 
 use std::path::Path;
 
@@ -78,7 +78,7 @@ fn bop(dataset: &Path, scene: u32, object: u32, images: &[u32]) -> Result<(), Fa
         let all = &scene.image(*image)?.ground_truth;
         truth.push(all.iter().find(|t| t.obj_id == object).map(|t| t.camera_from_object));
     }
-    // Scores need no length; the reconstruction does: 0.1 m along x of the object's frame, as its ground truth shows it.
+    // The scores need no scale, but the reconstruction does: 0.1 m along x of the object's frame, according to its ground truth.
     let end = |pose: &Pose, x: f64| {
         camera.project(&pose.transform_point(&Vec3::new(x, 0.0, 0.0))).map(<[f64; 2]>::from)
     };

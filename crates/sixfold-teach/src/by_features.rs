@@ -1,5 +1,5 @@
-//! The first step of a teaching without a board: features of all photographs, then their poses; and the length that says how large
-//! everything is.
+//! The first step of a teaching without a board: features of all photographs, then their poses; and the known length that gives the
+//! scale.
 
 use sixfold_geometry::Progress;
 use sixfold_io::{ImageFile, read_depth, read_rgb};
@@ -11,8 +11,8 @@ use crate::teaching::{By, Step, Teaching, World, is_same, rows};
 use crate::unboarded::{KnownLength, PutTogether, SeenFeatures, features_of, put_together};
 
 impl Teaching {
-    /// Gives the length between two points that somebody marked, by the numbers of the photographs; `None` to take the scale from
-    /// measured depth. Without a board only; poses are found again where it is another one.
+    /// Sets the length between two points that a person marked, with the photographs by number; `None` to take the scale from
+    /// measured depth. Only without a board. If the length changes, the poses are found again.
     ///
     /// # Errors
     /// [`TeachError::NoPhotograph`], [`TeachError::Io`].
@@ -30,7 +30,7 @@ impl Teaching {
         self.save()
     }
 
-    /// Whether a photograph that is used was not there when poses were found.
+    /// Whether a used photograph was added after the poses were found.
     pub(crate) fn lacks_poses(&self) -> bool {
         let lacks = |p: &crate::teaching::Photograph| {
             !p.left_out_by_person && p.left_out.is_none() && p.camera_from_board.is_none()
@@ -38,7 +38,8 @@ impl Teaching {
         self.known.state.world == World::Features && self.photographs().iter().any(lacks)
     }
 
-    /// Finds camera, poses and floor from features. Progress counts a photograph's features as much as everything that follows for it.
+    /// Finds camera, poses and floor from features. In the progress, the features of a photograph count as much as all later steps
+    /// for it.
     pub(crate) fn locate_by_features(&mut self, progress: &dyn Progress) -> Result<(), TeachError> {
         let used: Vec<usize> =
             (0..self.photographs().len()).filter(|i| !self.photographs()[*i].left_out_by_person).collect();
@@ -48,7 +49,7 @@ impl Teaching {
             Some((file, unit)) => Ok(Some(read_depth(&self.path("depth", file), *unit)?)),
             None => Ok(None),
         };
-        // Before anything takes time.
+        // Check this before the slow steps.
         if length.is_none() && used.iter().all(|i| self.photographs()[*i].depth.is_none()) {
             return Err(TeachError::NoScale);
         }
@@ -85,7 +86,7 @@ impl Teaching {
                 Ok(pose) => (Some(rows(&pose)), None),
                 Err(reason) => (None, Some(reason)),
             };
-            // Also where a person had corrected one: that was in another frame.
+            // This also replaces poses that a person had corrected: they were in another frame.
             let photograph = &mut self.known.state.photographs[*number];
             photograph.pose_by = pose.map(|_| By::Program);
             (photograph.camera_from_board, photograph.left_out) = (pose, reason);

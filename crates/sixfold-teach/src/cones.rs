@@ -1,5 +1,5 @@
-//! The space that masks leave to an object: the common part of the cones through them, by votes on a coarse grid. For photographs
-//! without a board, which would say where to look.
+//! The volume of an object from masks: the intersection of the cones through them, by votes on a coarse grid. For photographs
+//! without a board, which would give the volume.
 
 use sixfold_geometry::{Camera, Image, Mask, Mat3, Pose, Vec2, Vec3};
 
@@ -9,36 +9,36 @@ use crate::view::{Volume, bilinear};
 
 /// Voxels along the longest side.
 const CELLS: usize = 48;
-/// Fraction of the photographs that show a voxel which may say that it is empty.
+/// Fraction of the photographs showing a voxel that may vote that it is empty.
 const DISSENT: f64 = 0.15;
-/// A mask's border, and a pose, may be wrong by this much, pixels.
+/// Tolerance for errors of a mask's border and of a pose, pixels.
 const MARGIN: f32 = 2.0;
-/// The first box against the size of the masks: a mask may show a part of the object alone.
+/// Size of the first box relative to the size of the masks: a mask may show only a part of the object.
 const FIRST: f64 = 2.0;
-/// How often the box is made larger or smaller at most.
+/// Maximum number of times that the box is made larger or smaller.
 const ROUNDS: usize = 6;
-/// Two rays that enclose less do not say where they meet, radians.
+/// Two rays that enclose a smaller angle do not determine an intersection, radians.
 const PARALLEL: f64 = 0.05;
 
-/// A photograph's mask with where it was taken.
+/// A photograph's mask with camera and pose.
 #[derive(Debug, Clone, Copy)]
 pub struct Cone<'a> {
-    /// The camera of the mask's pixels; its lens distortion does not count.
+    /// The camera of the mask's pixels; its lens distortion is ignored.
     pub camera: &'a Camera,
     /// Takes points of the world to the camera's frame.
     pub camera_from_world: &'a Pose,
-    /// Where the object is seen, without lens distortion.
+    /// The pixels that show the object, without lens distortion.
     pub mask: &'a Mask,
-    /// Where something hides what is behind it, without lens distortion.
+    /// The pixels where something may occlude the object, without lens distortion.
     pub unknown: Option<&'a Mask>,
 }
 
-/// A cone ready for votes.
+/// A cone prepared for votes.
 struct Ready<'a> {
     camera: Camera,
     pose: &'a Pose,
     mask: &'a Mask,
-    /// To the border of what is not certainly empty, pixels.
+    /// Signed distance to the border of the region that is not certainly empty, pixels.
     possible: Image<f32>,
     eye: Vec3,
     /// Towards the centre of the mask's box.
@@ -66,7 +66,7 @@ impl<'a> Ready<'a> {
         Some(Ready { camera, pose: cone.camera_from_world, mask: cone.mask, possible, eye, direction, half })
     }
 
-    /// Whether a ball is certainly empty, and whether its centre is on the object; `None` where it is not in sight.
+    /// Whether a ball is certainly empty, and whether its centre projects into the mask; `None` if it is not in the image.
     fn vote(&self, point: &Vec3, radius: f64) -> Option<(bool, bool)> {
         let p = self.pose.transform_point(point);
         let pixel = self.camera.project(&p)?;
@@ -80,8 +80,8 @@ impl<'a> Ready<'a> {
     }
 }
 
-/// The box around what the masks have in common, with a margin; `None` where they have nothing in common, or where all are seen from
-/// one direction. Photographs whose mask has no pixel count for nothing.
+/// The box around the intersection of the masks' cones, with a margin; `None` if the intersection is empty or all photographs are
+/// from one direction. Photographs with an empty mask are ignored.
 pub fn volume_of_masks(cones: &[Cone<'_>]) -> Option<Volume> {
     let ready: Vec<Ready<'_>> = cones.iter().filter_map(Ready::new).collect();
     let centre = meeting_point(&ready)?;
@@ -106,7 +106,7 @@ pub fn volume_of_masks(cones: &[Cone<'_>]) -> Option<Volume> {
     Some(volume)
 }
 
-/// What the votes leave of a box, and the size of a voxel.
+/// The part of a box that remains after the votes, and the size of a voxel.
 fn left(ready: &[Ready<'_>], volume: &Volume) -> Option<(Volume, f64)> {
     let radius = 0.5 * 3f64.sqrt() * volume.size().max() / CELLS as f64;
     let grid = Grid::new(volume, CELLS, |point| {
@@ -123,7 +123,7 @@ fn left(ready: &[Ready<'_>], volume: &Volume) -> Option<(Volume, f64)> {
     Some((grid.volume_of(parts.first()?), grid.step))
 }
 
-/// The point nearest to the rays through the masks' middles: least squares, weighted again by the inverse of the distances.
+/// The point nearest to the rays through the masks' centres: least squares, reweighted by the inverse of the distances.
 fn meeting_point(ready: &[Ready<'_>]) -> Option<Vec3> {
     let apart = |a: &Ready<'_>, b: &Ready<'_>| a.direction.cross(&b.direction).norm() > PARALLEL;
     if !ready.iter().any(|a| ready.iter().any(|b| apart(a, b))) {
@@ -144,7 +144,7 @@ fn meeting_point(ready: &[Ready<'_>]) -> Option<Vec3> {
             *weight = 1.0 / (towards.cross(&r.direction).norm() / towards.norm() + 1e-3);
         }
     }
-    // Before the cameras that see it.
+    // It has to be in front of the cameras.
     let before = ready.iter().filter(|r| (point - r.eye).dot(&r.direction) > 0.0).count();
     (point.iter().all(|v| v.is_finite()) && 2 * before > ready.len()).then_some(point)
 }
@@ -201,7 +201,7 @@ mod tests {
             .collect();
         let mut masks: Vec<Mask> = poses.iter().map(|p| ball(&centre, p)).collect();
         let mut unknown: Vec<Option<Mask>> = vec![None; 10];
-        // One mask is somewhere else, another shows the right half alone, with something before the left.
+        // One mask is at the wrong place; another shows only the right half, with an occluder in front of the left.
         masks[3] = Image::from_fn(320, 240, |x, y| x < 30 && y < 30);
         let [x, _, width, _] = masks[6].bounding_box().unwrap();
         let hidden = x + width / 2;

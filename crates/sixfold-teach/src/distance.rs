@@ -2,18 +2,18 @@
 
 use sixfold_geometry::{Image, Mask};
 
-/// How far each pixel is from the border of a mask, pixels: below zero inside, above zero outside.
+/// Signed distance of each pixel to the border of a mask, pixels: below zero inside, above zero outside.
 pub(crate) fn signed_distance(mask: &Mask) -> Image<f32> {
     let (width, height) = mask.size();
     let outside = squared_distance(mask, true);
     let inside = squared_distance(mask, false);
     Image::from_fn(width, height, |x, y| {
-        // Between two pixels, half a pixel from each.
+        // The border is between two pixels, half a pixel from each.
         if mask[(x, y)] { 0.5 - inside[(x, y)].sqrt() } else { outside[(x, y)].sqrt() - 0.5 }
     })
 }
 
-/// The squared distance to the nearest pixel of a value; the image's diagonal where there is none.
+/// The squared distance to the nearest pixel of a value; the squared diagonal of the image if there is none.
 fn squared_distance(mask: &Mask, of: bool) -> Image<f32> {
     let (width, height) = mask.size();
     let far = (width * width + height * height) as f32;
@@ -32,7 +32,7 @@ fn squared_distance(mask: &Mask, of: bool) -> Image<f32> {
     image.map(|v| v.min(far))
 }
 
-/// The lower envelope of parabolas at each of its places.
+/// The lower envelope of the parabolas at all pixels of a line.
 fn along_line(values: &[f32]) -> Vec<f32> {
     let n = values.len();
     let (mut roots, mut bounds) = (vec![0usize; n], vec![0.0f32; n + 1]);

@@ -53,27 +53,27 @@ pub enum TeachError {
     Camera {
         /// Why.
         source: BoardError,
-        /// Of the photographs; empty or `; FILE: REASON; ...`.
+        /// Reasons of single photographs; empty or `; FILE: REASON; ...`.
         reasons: String,
     },
-    /// The camera given is that of another size of image.
+    /// The given camera is for another image size.
     #[error(
         "photographs have {width}x{height} pixels, the camera file is for {camera_width}x{camera_height}"
     )]
     CameraSize {
-        /// Of the photographs.
+        /// Width of the photographs, pixels.
         width: usize,
-        /// Of the photographs.
+        /// Height of the photographs, pixels.
         height: usize,
-        /// Of the camera.
+        /// Width of the camera's images, pixels.
         camera_width: usize,
-        /// Of the camera.
+        /// Height of the camera's images, pixels.
         camera_height: usize,
     },
     /// No photograph at all.
     #[error("there is no photograph: take 12 to 40 from all sides")]
     NoPhotographs,
-    /// Photographs without a board that cannot be put together.
+    /// Photographs without a board that cannot be registered to each other.
     #[error(
         "{found} photographs show enough of the same, expected at least {least}: take 16 to 40 in steps of at most 20 degrees around \
          the object, sharp, on a ground with much texture (newspaper, a patterned cloth) that stays in place{reasons}"
@@ -86,22 +86,22 @@ pub enum TeachError {
         /// Why the others do not; empty or `; FILE: REASON; ...`.
         reasons: String,
     },
-    /// Photographs without a board that cannot be put together, for another reason.
+    /// Photographs without a board that cannot be registered to each other, for another reason.
     #[error("poses from photographs: {0}")]
     Sfm(#[source] SfmError),
-    /// Without a board nothing says how long a metre is.
+    /// Without a board the scale in metres is unknown.
     #[error(
         "photographs without a board do not show how large things are: give the length between two points that you marked in \
          two or more photographs (--length 0.12 --ends PHOTOGRAPH:X,Y:X,Y), or depth images"
     )]
     NoScale,
-    /// Depth images that do not show how large things are.
+    /// Depth images from which the scale cannot be computed.
     #[error(
         "{found} features of the photographs have a measured depth, expected at least {least}: check --depth-scale and whether depth \
          images are from the same places, or give --length and --ends"
     )]
     FewDepths {
-        /// How many have.
+        /// Number of features with a measured depth.
         found: usize,
         /// How many are needed.
         least: usize,
@@ -109,13 +109,13 @@ pub enum TeachError {
     /// Marked points that give no length.
     #[error("--ends: {what}")]
     Ends {
-        /// What was found and expected.
+        /// The values found and expected.
         what: String,
     },
     /// No features can be searched in an image.
     #[error("features of a photograph: {0}")]
     Features(#[source] KeypointError),
-    /// Nothing stands on the board.
+    /// There is no object on the board.
     #[error(
         "no object was found that all photographs agree on: expected one object on the board, opaque, in the same place in every \
          photograph{hint}"
@@ -129,7 +129,7 @@ pub enum TeachError {
         "found {found} objects on the board, the second {percent:.0} % as large as the first: leave one, or give masks"
     )]
     SeveralObjects {
-        /// How many.
+        /// Number of objects.
         found: usize,
         /// Size of the second against the first, percent.
         percent: f64,
@@ -140,15 +140,15 @@ pub enum TeachError {
          from photographs, nor what moved between them; correct the masks, or give a mesh"
     )]
     Contradicting {
-        /// How many.
+        /// Number of contradicting masks.
         contradicting: usize,
-        /// Of how many.
+        /// Number of masks.
         all: usize,
     },
-    /// A mask or pose for a photograph that is not there.
+    /// A mask or pose for a photograph that does not exist.
     #[error("photograph {index}: there are {photographs}, numbered from 0")]
     NoPhotograph {
-        /// What was asked for.
+        /// The requested number.
         index: usize,
         /// How many there are.
         photographs: usize,
@@ -160,13 +160,13 @@ pub enum TeachError {
     MaskSize {
         /// The photograph.
         name: String,
-        /// Of the mask.
+        /// Width of the mask, pixels.
         width: usize,
-        /// Of the mask.
+        /// Height of the mask, pixels.
         height: usize,
-        /// Of the photograph.
+        /// Width of the photograph, pixels.
         photograph_width: usize,
-        /// Of the photograph.
+        /// Height of the photograph, pixels.
         photograph_height: usize,
     },
     /// A given mesh of another size than the object in the photographs.
@@ -192,10 +192,10 @@ pub enum TeachError {
     /// Marked points that give no pose.
     #[error("pose from points: {what}")]
     Pairs {
-        /// What was found and expected.
+        /// The values found and expected.
         what: String,
     },
-    /// A step before one that it needs.
+    /// A step was started before one that it needs.
     #[error("{missing} first")]
     Order {
         /// What has to be done.
@@ -204,13 +204,13 @@ pub enum TeachError {
     /// Interrupted.
     #[error("interrupted; what was finished is kept")]
     Stopped,
-    /// The network that sees masks.
+    /// The network for masks failed.
     #[error("cannot find masks")]
     Masks(#[source] Box<dyn std::error::Error + Send + Sync>),
     /// An image cannot be read or written.
     #[error(transparent)]
     Image(#[from] ImageFileError),
-    /// A file of the folder is not what it should be.
+    /// A file of the folder is invalid.
     #[error("{}: {what}", path.display())]
     File {
         /// The file.
@@ -223,7 +223,7 @@ pub enum TeachError {
     Io {
         /// The file or folder.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
     /// The object cannot be stored.

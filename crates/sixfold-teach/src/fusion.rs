@@ -1,4 +1,5 @@
-//! Depth of several views in one field of signed distances (Curless and Levoy 1996), within the visual hull.
+//! Fusion of the depth of several views into one field of signed distances (Curless and Levoy 1996), within the visual
+//! hull.
 
 use rayon::prelude::*;
 use sixfold_geometry::{DepthImage, Vec3};
@@ -9,12 +10,12 @@ use crate::view::View;
 /// Standard deviation of that smoothing, voxels.
 const SMOOTH: f64 = 1.2;
 
-/// Cuts away from a hull what depth shows to be empty. `reach` is how far behind a measurement it still counts, metres, and
-/// `least` how many views have to say so.
+/// Carves from a hull the space that depth shows to be empty. A measurement counts up to `reach` metres behind the measured
+/// surface; at least `least` views have to agree.
 pub(crate) fn carved(hull: &Grid, views: &[View], depths: &[DepthImage], reach: f64, least: f32) -> Grid {
     let mut carved = hull.clone();
     carved.values.par_iter_mut().enumerate().for_each(|(index, value)| {
-        // Far outside already.
+        // This point is far outside already.
         if f64::from(*value) > reach {
             return;
         }
@@ -22,14 +23,16 @@ pub(crate) fn carved(hull: &Grid, views: &[View], depths: &[DepthImage], reach: 
             *value = value.max(distance);
         }
     });
-    // A single wrong depth drills a hole of one voxel, a hollow is wide: what was cut is smoothed, the hull is not.
+    // A single wrong depth makes a hole of one voxel, while a real hollow is wide: smooth the carved part, but not the
+    // hull.
     let cut = carved.values.iter().zip(&hull.values).map(|(c, h)| c - h).collect();
     let cut = Grid { values: cut, ..carved }.smoothed(SMOOTH);
     let values = cut.values.iter().zip(&hull.values).map(|(c, h)| c + h).collect();
     Grid { values, ..cut }
 }
 
-/// How far a point is before the measured surface, metres, at most `reach` either way; `None` where too few views say.
+/// How far a point is in front of the measured surface, metres, limited to `reach` in both directions; `None` if too few
+/// views have a measurement.
 fn distance(point: &Vec3, views: &[View], depths: &[DepthImage], reach: f64, least: f32) -> Option<f32> {
     let (mut sum, mut weight) = (0.0, 0.0);
     for (view, depth) in views.iter().zip(depths) {

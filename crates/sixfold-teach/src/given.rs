@@ -1,4 +1,4 @@
-//! Masks that somebody gave, and where they, or what stands out in whole photographs, say that the object is.
+//! Masks given by a person, and the volume of the object from them or from the salient region of whole photographs.
 
 use sixfold_geometry::{Camera, Image, Mask, Pose};
 
@@ -9,7 +9,7 @@ use crate::shape::{Capture, NOT_IN_SIGHT, Segmentation, ShapeOptions};
 use crate::silhouette::{Segmenter, without_specks};
 use crate::view::{PosedPhotograph, Volume};
 
-/// Where masks say that the object is: those that were given, or where there are none what stands out in whole photographs.
+/// The volume of the object from masks: the given ones or, if there are none, the salient regions of whole photographs.
 pub(crate) fn searched_volume(
     capture: &Capture,
     segmenter: &dyn Segmenter,
@@ -28,7 +28,7 @@ pub(crate) fn searched_volume(
     })
 }
 
-/// A photograph's mask with all that a cone needs.
+/// A photograph's mask with the data of a cone.
 struct Masked {
     camera: Camera,
     pose: Pose,
@@ -62,7 +62,7 @@ impl Masked {
     }
 }
 
-/// The pixels that certainly show the object, of a photograph whose mask was given.
+/// The pixels that certainly show the object, in a photograph whose mask was given.
 pub(crate) fn certain(p: &PosedPhotograph) -> Option<Mask> {
     let mask = p.mask.as_ref()?;
     Some(match &p.hidden {
@@ -73,7 +73,7 @@ pub(crate) fn certain(p: &PosedPhotograph) -> Option<Mask> {
     })
 }
 
-/// The masks, where somebody gave all of them: nothing is searched then.
+/// The masks, if all of them were given: nothing is searched then.
 pub(crate) fn given_masks(capture: &Capture, volume: &Volume) -> Option<Segmentation> {
     let certain: Vec<Mask> = capture.photographs.iter().map(certain).collect::<Option<_>>()?;
     let (mut masks, mut left_out) = (vec![], vec![]);

@@ -1,11 +1,11 @@
-//! A field of numbers on a grid of voxels.
+//! A scalar field on a grid of voxels.
 
 use rayon::prelude::*;
 use sixfold_geometry::Vec3;
 
 use crate::view::Volume;
 
-/// A number at each corner of a grid of equal cubes; x runs fastest.
+/// A number at each corner of a grid of equal cubes; x varies fastest.
 #[derive(Debug, Clone)]
 pub(crate) struct Grid {
     pub low: Vec3,
@@ -58,7 +58,7 @@ impl Grid {
         })
     }
 
-    /// Parts of the grid in which values are below zero, connected through faces: for each its voxels, largest first.
+    /// The connected components (through faces) of values below zero, each as a list of voxels, largest first.
     pub fn components(&self) -> Vec<Vec<usize>> {
         let mut seen = vec![false; self.values.len()];
         let mut components = vec![];

@@ -1,10 +1,10 @@
-//! A ground with texture for simulated photographs without a board: a cloth of discs and rectangles of many sizes and colours.
+//! A textured ground for simulated photographs without a board: a cloth with discs and rectangles of many sizes and colours.
 
 use rayon::prelude::*;
 use sixfold_geometry::random::{Random, stream, uniform};
 use sixfold_geometry::{RgbImage, Vec2};
 
-/// Shapes for each 1000 pixels squared.
+/// Number of shapes per 1000 x 1000 pixels.
 const SHAPES: f64 = 900.0;
 /// Smallest and largest half side of a shape, as a fraction of the image's side.
 const SIZES: [f32; 2] = [0.002, 0.03];
@@ -47,7 +47,7 @@ pub fn patterned(side: usize, seed: u64) -> RgbImage {
         let near: Vec<&Shape> =
             shapes.iter().filter(|s| (s.centre.y - y).abs() < s.half[0].hypot(s.half[1])).collect();
         let color = move |x: usize| {
-            // The last shape lies on top.
+            // The last shape is on top.
             let at = near.iter().rev().find(|s| s.holds(&Vec2::new(x as f64, y)));
             at.map_or([170, 160, 140], |s| s.color)
         };

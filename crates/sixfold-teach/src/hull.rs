@@ -7,15 +7,15 @@ use crate::grid::Grid;
 use crate::silhouette::without_holes;
 use crate::view::{View, Volume, bilinear};
 
-/// From this many photographs on, a hole in one mask alone is none.
+/// From this many photographs on, a hole has to be in more than one mask.
 const ONE_MAY_BE_WRONG: usize = 12;
 
 /// A view with the signed distance to its mask's border.
 pub(crate) struct Outlined<'a> {
     view: &'a View,
-    /// To the outer border: holes count as inside.
+    /// Signed distance to the outer border: holes count as inside.
     outer: Image<f32>,
-    /// To any border; `None` where the mask has no hole.
+    /// Signed distance to any border; `None` if the mask has no hole.
     any: Option<Image<f32>>,
 }
 
@@ -26,7 +26,7 @@ impl<'a> Outlined<'a> {
         Outlined { view, outer: signed_distance(&filled), any }
     }
 
-    /// How far a point is outside the cones of the outer border and of the mask, metres; `None` where the view does not show it.
+    /// How far a point is outside the cones of the outer border and of the mask, metres; `None` if it is not in the view.
     fn outside(&self, point: &Vec3) -> Option<[f32; 2]> {
         let (pixel, depth) = self.view.project(point)?;
         let scale = (depth / self.view.camera.fx) as f32;
@@ -36,12 +36,13 @@ impl<'a> Outlined<'a> {
     }
 }
 
-/// The signed distance to the hull on a grid, metres, below zero inside; points that no view shows are outside. `floor` is where
-/// the object stands: what is below is outside.
+/// The signed distance to the hull on a grid, metres, below zero inside; points that no view shows are outside. `floor` is the
+/// plane on which the object stands: everything below is outside.
 pub(crate) fn hull(views: &[Outlined<'_>], volume: &Volume, cells: usize, floor: Option<Plane>) -> Grid {
     let ignored = usize::from(views.len() >= ONE_MAY_BE_WRONG);
     Grid::new(volume, cells, |point| {
-        // Beyond the outer border of one mask is outside; a hole has to be seen in two, lest one wrong mask drills through.
+        // A point beyond the outer border of one mask is outside. A hole has to be in two masks, so that one wrong mask does not
+        // make a hole.
         let (mut outer, mut largest) = (f32::NEG_INFINITY, [f32::NEG_INFINITY; 2]);
         for [beyond, distance] in views.iter().filter_map(|view| view.outside(point)) {
             outer = outer.max(beyond);

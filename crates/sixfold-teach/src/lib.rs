@@ -1,13 +1,14 @@
-//! A new object from photographs: it stands on a printed board of tags, or on a ground with texture, and is photographed from all sides.
+//! A new object from photographs: it stands on a printed board of tags, or on a textured ground, and is photographed from all
+//! sides.
 //!
-//! [`locate`] finds camera and poses from the board, [`put_together`] without one from local features; [`segment`] the object in every photograph (what stands out, what hides the
-//! print of the board, and what all photographs agree on), [`reconstruct`] a closed, coloured mesh: the visual hull, cut where
-//! photographs or measured depth show it to be hollow. [`Teaching`] keeps all steps in a folder, so that each can be inspected,
-//! corrected and resumed, and stores the object for all methods. [`simulation`] takes such photographs with exact truth.
+//! [`locate`] finds camera and poses from the board, [`put_together`] finds them without a board from local features. [`segment`]
+//! finds the object in every photograph, from salience, from the covered print of the board, and from the consensus of all
+//! photographs. [`reconstruct`] makes a closed, coloured mesh: the visual hull, carved where photographs or measured depth show it
+//! to be hollow. [`Teaching`] keeps all steps in a folder, so that each can be inspected, corrected and resumed, and stores the
+//! object for all methods. [`simulation`] renders such photographs with exact ground truth.
 //!
-//! The world's frame is the board's: origin in the middle of the tags, z out of the sheet; metres. Without a board z is the normal of the
-//! plane on which the object stands. The object's frame has its
-//! origin in the middle of the mesh's box and the same axes.
+//! The world's frame is the board's: origin at the centre of the tags, z out of the sheet; metres. Without a board z is the normal
+//! of the plane on which the object stands. The object's frame has its origin at the centre of the mesh's box and the same axes.
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
 mod by_features;

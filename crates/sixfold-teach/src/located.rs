@@ -13,7 +13,7 @@ use crate::error::TeachError;
 /// The tags that a photograph shows.
 #[derive(Debug, Clone)]
 pub struct SeenTags {
-    /// What messages call the photograph.
+    /// The photograph's name in messages.
     pub name: String,
     /// Its width and height, pixels.
     pub size: (usize, usize),
@@ -24,14 +24,14 @@ pub struct SeenTags {
 }
 
 impl SeenTags {
-    /// Looks for tags in a photograph.
+    /// Searches for tags in a photograph.
     pub fn of(name: impl Into<String>, image: &RgbImage) -> SeenTags {
         let Detections { tags, mirrored, .. } = detect_tags(image);
         SeenTags { name: name.into(), size: image.size(), mirrored: mirrored > tags.len(), tags }
     }
 }
 
-/// What photographs of a board say together.
+/// Camera and poses of all photographs of a board.
 #[derive(Debug, Clone)]
 pub struct Located {
     /// The board.
@@ -40,12 +40,12 @@ pub struct Located {
     pub camera: Camera,
     /// For each photograph the camera's pose, or why it has none.
     pub camera_from_board: Vec<Result<Pose, String>>,
-    /// Root of the mean squared distance of corners from where the board has them, pixels.
+    /// Root mean square distance of the detected corners to the projected corners of the board, pixels.
     pub rms: f64,
 }
 
-/// Finds the camera, if it is not known, and its pose in each photograph. `ruler` is what the ruler on the printed board measures,
-/// metres, if not 0.1.
+/// Finds the camera, if it is not known, and its pose in each photograph. `ruler` is the measured length of the ruler on the
+/// printed board, metres, if not 0.1.
 ///
 /// # Errors
 /// [`TeachError::NoBoard`], [`TeachError::CameraSize`], [`TeachError::Camera`].
@@ -102,7 +102,7 @@ fn usable(seen: &SeenTags, (width, height): (usize, usize)) -> Result<(), String
     Ok(())
 }
 
-/// The size of most photographs.
+/// The most common size of the photographs.
 pub(crate) fn common_size(sizes: impl Iterator<Item = (usize, usize)>) -> Option<(usize, usize)> {
     let mut counts: BTreeMap<(usize, usize), usize> = BTreeMap::new();
     for size in sizes {

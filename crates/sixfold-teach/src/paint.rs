@@ -1,4 +1,4 @@
-//! The colours of a mesh from the photographs, and how much of it none of them shows.
+//! The colours of a mesh from the photographs, and the fraction of its surface that none of them shows.
 
 use rayon::prelude::*;
 use sixfold_geometry::Vec3;
@@ -7,9 +7,9 @@ use sixfold_render::render_depth;
 
 use crate::view::{View, bilinear_rgb};
 
-/// How far a vertex may lie behind the rendered surface and still be seen, metres.
+/// How far a vertex may be behind the rendered surface and still count as visible, metres.
 const BEHIND: f64 = 0.003;
-/// Cosine of the flattest angle at which a surface is seen.
+/// Minimum cosine between the normal and the viewing ray for a surface to count as visible.
 const FLATTEST: f64 = 0.2;
 
 /// Vertex colours, and the fraction of the surface that no photograph shows.
@@ -18,7 +18,8 @@ pub(crate) struct Painted {
     pub unseen: f64,
 }
 
-/// The same surface with faces cut in four, again and again while there are not more than `most`: colours stand at vertices.
+/// The same surface with every face split into four, repeated while there are at most `most` faces: colours are stored per
+/// vertex.
 pub(crate) fn finer(mesh: &Mesh, most: usize) -> Mesh {
     let mut mesh = mesh.clone();
     while !mesh.faces().is_empty() && 4 * mesh.faces().len() <= most {
@@ -69,7 +70,7 @@ pub(crate) fn painted(mesh: &Mesh, views: &[View]) -> Painted {
     Painted { colors: filled(mesh, colors), unseen }
 }
 
-/// For each channel the weighted median: highlights move with the light, and a wrong photograph is one of several.
+/// The weighted median of each channel, which is robust to moving highlights and to single wrong photographs.
 fn middle_color(seen: &[(f64, [f64; 3])]) -> Option<[u8; 3]> {
     let total: f64 = seen.iter().map(|s| s.0).sum();
     if seen.is_empty() {
@@ -99,7 +100,7 @@ fn unseen_fraction(mesh: &Mesh, colors: &[Option<[u8; 3]>]) -> f64 {
     if all > 0.0 { unseen / all } else { 1.0 }
 }
 
-/// Vertices without a colour take that of their neighbours, from the border inwards.
+/// Vertices without a colour get the colour of their neighbours, from the border inwards.
 fn filled(mesh: &Mesh, mut colors: Vec<Option<[u8; 3]>>) -> Vec<[u8; 3]> {
     let mut around: Vec<Vec<u32>> = vec![vec![]; mesh.vertices().len()];
     for [a, b, c] in mesh.faces() {

@@ -4,14 +4,13 @@ use sixfold_geometry::{Camera, PnpOptions, Pose, Vec2, Vec3, p3p, pnp_ransac};
 
 use crate::error::TeachError;
 
-/// A marked point may be this far off, pixels in an image of 1000.
+/// Largest error of a marked point, in pixels of an image of 1000 pixels.
 const CLICK: f64 = 8.0;
-/// Two poses whose centres are nearer than this are one, metres.
+/// Two poses whose camera centres are nearer than this are the same, metres.
 const SAME: f64 = 1e-3;
 
-/// The pose of a photograph of which points of the board's frame (metres) were marked at pixels of its pinhole camera. Three points
-/// allow up to four poses: that one is taken which is nearest to `near`, where there is such a pose, or else the only one above the
-/// board.
+/// The pose of a photograph from points of the board's frame (metres) and their marked pixels in its pinhole camera. Three points
+/// allow up to four poses: the one nearest to `near` is taken, if `near` is given, otherwise the only one above the board.
 ///
 /// # Errors
 /// [`TeachError::Pairs`].
@@ -71,11 +70,11 @@ mod tests {
         let near = looking_at(&Vec3::new(0.01, 0.0, 0.03), 30.0, 40.0, 0.55, 0.0);
         let found = pose_of_points(&points[..3], &pixels[..3], &camera, Some(&near)).unwrap();
         assert!(found.distance_to(&truth) < 1e-6 && found.rotation_angle_to(&truth) < 1e-6);
-        // A person does not hit pixels exactly.
+        // People do not mark pixels exactly.
         let rough = pixels.map(|p| p + Vec2::new(0.7, -0.4));
         let found = pose_of_points(&points, &rough, &camera, None).unwrap();
         assert!(found.distance_to(&truth) < 0.01 && found.rotation_angle_to(&truth) < 0.02);
-        // Without a pose nearby three points give one, or say that they do not.
+        // Without a nearby pose, three points give a pose or an error.
         match pose_of_points(&points[..3], &pixels[..3], &camera, None) {
             Ok(found) => assert!(found.distance_to(&truth) < 1e-6),
             Err(error) => assert!(error.to_string().contains("fourth"), "{error}"),

@@ -1,4 +1,4 @@
-//! A picture to look at: every photograph with the outline of its mask and of the mesh.
+//! An image for inspection: every photograph with the outlines of its mask and of the mesh.
 
 use sixfold_geometry::{Image, Mask, RgbImage};
 use sixfold_render::render_depth;
@@ -6,18 +6,18 @@ use sixfold_render::render_depth;
 use crate::error::TeachError;
 use crate::snapshot::Snapshot;
 
-/// Width of a photograph in the picture, pixels.
+/// Width of a photograph in the image, pixels.
 const WIDTH: usize = 400;
 /// Photographs in a row.
 const COLUMNS: usize = 4;
-/// Most photographs that are shown.
+/// Maximum number of photographs that are shown.
 const MOST: usize = 40;
 const MASK: [u8; 3] = [255, 200, 0];
 const MESH: [u8; 3] = [0, 220, 255];
 
 impl Snapshot {
-    /// The photographs that are used, cut to the object and its surroundings: the border of the mask in yellow, the outline of the
-    /// mesh in blue.
+    /// The used photographs, cropped to the object and its surroundings, with the border of the mask in yellow and the outline of
+    /// the mesh in blue.
     ///
     /// # Errors
     /// [`TeachError`].
@@ -46,7 +46,7 @@ impl Snapshot {
     }
 }
 
-/// The surroundings of an outline, or of a mask where there is none, in a square image; both as lines.
+/// A square crop around an outline, or around a mask if there is no outline; both are drawn as lines.
 pub(crate) fn close_up(
     image: &RgbImage,
     mask: Option<&Mask>,

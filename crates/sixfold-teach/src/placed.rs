@@ -1,6 +1,6 @@
-//! Where a mesh that is known already stands in the photographs: many rotations are aligned with the visual hull by ICP, the best of them
-//! compared with the masks, and the pose moved until its outlines cover the masks best. Of poses with the same outlines (a box has
-//! four) colours decide, where the mesh has them.
+//! The pose of a given mesh in the photographs: many rotations are aligned with the visual hull by ICP, the best of them are
+//! compared with the masks, and the poses are refined until their outlines overlap the masks best. Between poses with the same
+//! outlines (a box has four) colours decide, if the mesh has them.
 
 use std::f64::consts::{PI, TAU};
 
@@ -19,9 +19,9 @@ use crate::view::View;
 /// Directions of the given mesh's z axis that are tried, and rotations about each.
 const DIRECTIONS: usize = 60;
 const ROTATIONS: usize = 12;
-/// Points of either surface while many rotations are compared.
+/// Points on each surface while many rotations are compared.
 const POINTS: usize = 250;
-/// Poses that are compared with the masks, and of these those that are refined.
+/// Number of poses that are compared with the masks, and of those that are refined.
 const COMPARED: usize = 40;
 const REFINED: usize = 4;
 /// Steps that are reported.
@@ -31,18 +31,18 @@ const FACES: usize = 4000;
 /// First step of the refinement: fraction of the diameter, radians; and how often it is halved.
 const FIRST_STEP: [f64; 2] = [0.01, 0.05];
 const HALVINGS: usize = 6;
-/// Most steps of one size.
+/// Maximum number of steps of one size.
 const SWEEPS: usize = 8;
-/// Poses that differ by less, as a fraction of the diameter, are one.
+/// Poses that differ by less than this fraction of the diameter are the same.
 const SAME: f64 = 0.08;
-/// How much agreement of the colours counts beside the agreement of the outlines.
+/// Weight of the agreement of colours relative to that of outlines.
 const COLORS: f64 = 0.1;
-/// The outlines of the right object at the right place agree at least this well.
+/// Minimum agreement of the outlines: the right object at the right pose reaches it.
 const FITS: f64 = 0.8;
 /// Diameters of mesh and hull may differ by this factor: the hull is a little too large, and closed below.
 const SIZES: f64 = 1.5;
 
-/// Lays a mesh into views with masks; `hull` is what the masks leave of the world. Returns the mesh's pose in the world.
+/// Finds the pose of a mesh in views with masks; `hull` is the visual hull of the masks. Returns the mesh's pose in the world.
 pub(crate) fn placed(
     given: &Mesh,
     hull: &Mesh,
@@ -76,7 +76,7 @@ pub(crate) fn placed(
     }
 }
 
-/// The greatest first; equal ones stay in order.
+/// Sorts by falling score; equal scores keep their order.
 fn sort(poses: &mut [(f64, Pose)]) {
     poses.sort_by(|a, b| b.0.total_cmp(&a.0));
 }
@@ -86,7 +86,7 @@ fn cloud(mesh: &Mesh, seed: u64) -> PointCloud {
     PointCloud { points: samples.points, normals: samples.normals }
 }
 
-/// Poses at which the surfaces agree, the best first, no two of them the same.
+/// Distinct poses at which the surfaces agree, the best first.
 fn aligned(given: &Mesh, hull: &Mesh) -> Vec<Pose> {
     let diameter = given.diameter();
     let (source, target) = (cloud(given, 1), cloud(hull, 2));
@@ -112,7 +112,8 @@ fn aligned(given: &Mesh, hull: &Mesh) -> Vec<Pose> {
                 source.points.iter().map(|p| near(target.tree(), &pose.transform_point(p))).collect();
             let home: Vec<f64> =
                 target.cloud().points.iter().map(|p| near(&own_tree, &back.transform_point(p))).collect();
-            // What is hollow in the mesh is full in the hull: the way there says less than the way back.
+            // Hollows of the mesh are filled in the hull, so distances from the mesh to the hull count less than those from the
+            // hull to the mesh.
             (-(0.5 * mean(&out).unwrap_or(diameter) + mean(&home).unwrap_or(diameter)), pose)
         })
         .collect();
@@ -134,7 +135,7 @@ fn aligned(given: &Mesh, hull: &Mesh) -> Vec<Pose> {
     distinct
 }
 
-/// Rotations that lie evenly: directions on a spiral over the sphere, and about each a full turn in steps.
+/// Evenly spaced rotations: directions on a spiral over the sphere, and a full turn in steps about each.
 fn rotations() -> Vec<UnitQuaternion<f64>> {
     let golden = PI * (3.0 - 5f64.sqrt());
     let mut all = vec![];
@@ -162,7 +163,7 @@ fn corners(mesh: &Mesh) -> [Vec3; 8] {
     std::array::from_fn(|k| Vec3::from_fn(|i, _| if k >> i & 1 == 0 { low[i] } else { high[i] }))
 }
 
-/// Outlines held against masks.
+/// Comparison of outlines with masks.
 struct Fit<'a> {
     mesh: Mesh,
     views: &'a [View],
@@ -178,7 +179,7 @@ impl Fit<'_> {
         (buffer, camera_from_object)
     }
 
-    /// Mean over the views of what outline and mask have in common against what either has.
+    /// Mean intersection over union of outline and mask over the views.
     fn overlap(&self, pose: &Pose) -> f64 {
         let of_view = |(view, mask): (&View, &Mask)| {
             let (buffer, _) = self.buffer(&self.mesh, view, pose);
@@ -187,12 +188,12 @@ impl Fit<'_> {
             let either = pairs().filter(|(d, m)| **d > 0.0 || **m).count();
             both as f64 / either.max(1) as f64
         };
-        // In order, so that the sum is the same at any number of threads.
+        // Collected in order, so that the sum is the same for any number of threads.
         let all: Vec<f64> = self.views.par_iter().zip(self.masks).map(of_view).collect();
         mean(&all).unwrap_or(0.0)
     }
 
-    /// Moves a pose along and about the axes through the object's middle as long as outlines agree better.
+    /// Shifts and rotates a pose along and about the axes through the object's centre as long as the overlap improves.
     fn refined(&self, pose: &Pose) -> (f64, Pose) {
         let mut best = (self.overlap(pose), *pose);
         let mut size = [FIRST_STEP[0] * self.diameter, FIRST_STEP[1]];
@@ -226,7 +227,7 @@ impl Fit<'_> {
         Pose::new(step.rotation() * pose.rotation(), step.rotation() * shifted + middle + step.translation())
     }
 
-    /// How well the mesh's own colours agree with the photographs: mean correlation over the views; 0 for a mesh without colours.
+    /// Agreement of the mesh's own colours with the photographs: mean correlation over the views; 0 for a mesh without colours.
     fn colors(&self, given: &Mesh, pose: &Pose) -> f64 {
         if given.colors().is_none() && given.texture().is_none() {
             return 0.0;
@@ -254,7 +255,7 @@ fn mean(values: &[f64]) -> Option<f64> {
     (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
 }
 
-/// Pearson's; 0 where either is constant.
+/// Pearson's correlation; 0 if either is constant.
 fn correlation(a: &[f64], b: &[f64]) -> f64 {
     let (Some(ma), Some(mb)) = (mean(a), mean(b)) else { return 0.0 };
     let sum = |f: &dyn Fn(f64, f64) -> f64| a.iter().zip(b).map(|(x, y)| f(x - ma, y - mb)).sum::<f64>();

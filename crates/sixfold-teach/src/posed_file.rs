@@ -1,4 +1,5 @@
-//! A teaching from a file that lists photographs with the object's pose in each: poses of a robot arm, of a tracker, of annotators.
+//! A teaching from a file that lists photographs with the object's pose in each, for example from a robot arm, a tracker or
+//! annotators.
 
 use std::path::{Path, PathBuf};
 
@@ -19,8 +20,8 @@ fn bytes_of(path: &Path) -> Result<Vec<u8>, TeachError> {
 }
 
 impl Teaching {
-    /// Opens the folder, or begins in a new one, with the photographs, poses, masks and depth images that a [`PhotographFile`] lists.
-    /// `mesh` (metres) stands in for one that the file names; with neither, the mesh is made from the photographs. Photographs of the
+    /// Opens or creates the folder, with the photographs, poses, masks and depth images that a [`PhotographFile`] lists. `mesh`
+    /// (metres) replaces the mesh that the file names; without either, the mesh is made from the photographs. Photographs of the
     /// folder that the file does not list are left out.
     ///
     /// # Errors
@@ -63,7 +64,7 @@ impl Teaching {
         Ok(())
     }
 
-    /// Leaves out the photographs whose names are not among these, as those of an earlier run in the same folder, and uses these.
+    /// Uses the photographs with these names and leaves out all others, such as those of an earlier run in the same folder.
     ///
     /// # Errors
     /// [`TeachError::Io`].
@@ -76,7 +77,7 @@ impl Teaching {
     }
 }
 
-/// The camera that all photographs of a file name.
+/// The camera that all photographs of a file share.
 fn common_camera(list: &PhotographFile, file: &Path, beside: &Path) -> Result<Camera, TeachError> {
     let mut common: Option<(Camera, &str)> = None;
     for entry in &list.photographs {

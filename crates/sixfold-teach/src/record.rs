@@ -1,4 +1,4 @@
-//! What is kept of a taught object: its mesh with symmetries, and its photographs with poses and masks, in the object's folder.
+//! The record of a taught object in the object's folder: its mesh with symmetries, and its photographs with poses and masks.
 //!
 //! `photographs/photographs.json` has the form that `sixfold synthesize --photographs` takes: mesh, unit, and for each photograph its
 //! image, camera, pose (BOP's, millimetres) and mask.
@@ -24,7 +24,7 @@ const PHOTOGRAPHS: &str = "photographs";
 /// Noise of a surface made from photographs, standard deviation as a fraction of the diameter.
 const NOISE: f64 = 0.004;
 
-/// What was stored.
+/// A stored object.
 #[derive(Debug, Clone)]
 pub struct Stored {
     /// Its record.
@@ -38,7 +38,7 @@ pub struct Stored {
 type Failure = Box<dyn std::error::Error + Send + Sync>;
 
 impl Snapshot {
-    /// Symmetries of the mesh with evidence; those that are sure by shape and colours will be stored.
+    /// Symmetries of the mesh with evidence; those that are sure by shape and colours are stored later.
     ///
     /// # Errors
     /// [`TeachError::Order`] before the mesh is made.
@@ -47,7 +47,7 @@ impl Snapshot {
         Ok(symmetries_of(&mesh, ModelInfo::of_mesh(&mesh).diameter))
     }
 
-    /// Stores the object under a name. `derive` makes what methods derive from it, as in [`ObjectStore::add`].
+    /// Stores the object under a name. `derive` computes the data that methods derive from it, as in [`ObjectStore::add`].
     ///
     /// # Errors
     /// [`TeachError::Order`] before the mesh is made, [`TeachError::Store`].
@@ -115,7 +115,7 @@ fn write_photographs(folder: &Path, posed: &[Posed]) -> Result<(), Failure> {
     Ok(write_atomically(&folder.join("photographs.json"), text.as_bytes())?)
 }
 
-/// The file that names a stored object's photographs; `None` where it has none.
+/// The file that lists a stored object's photographs; `None` if it has none.
 pub fn photographs_of(object: &Object) -> Option<PathBuf> {
     object.file(PHOTOGRAPHS).map(|folder| folder.join("photographs.json")).filter(|file| file.is_file())
 }
@@ -124,7 +124,7 @@ pub fn photographs_of(object: &Object) -> Option<PathBuf> {
 /// with poses and masks as scene 1 of split `train_real`. Returns the number of images.
 ///
 /// # Errors
-/// [`TeachError::File`] where a file of the object is not what it should be or the dataset cannot be written.
+/// [`TeachError::File`] if a file of the object is invalid or the dataset cannot be written.
 pub fn export_bop(object: &Object, id: u32, dataset: &Path) -> Result<usize, TeachError> {
     let failed = |what: String| TeachError::File { path: dataset.to_owned(), what };
     let mesh = object.needed_mesh("ppf").map_err(|e| failed(e.to_string()))?;

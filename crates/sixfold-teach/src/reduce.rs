@@ -1,4 +1,4 @@
-//! Photographs of many megapixels, made smaller before they are worked on.
+//! Reduction of photographs of many megapixels before they are processed.
 
 use std::sync::Arc;
 
@@ -29,8 +29,8 @@ pub(crate) fn reduced_photograph(photograph: PosedPhotograph, side: usize) -> Po
     PosedPhotograph { image, depth, mask, hidden, camera, ..photograph }
 }
 
-/// A photograph with at most `side` pixels along its longer side and, where its lens is known, without distortion, with the camera that
-/// would have taken that.
+/// A photograph with at most `side` pixels along its longer side and, if its lens is known, without distortion; and the camera of
+/// the new image.
 pub(crate) fn undistorted(
     image: &RgbImage,
     lens: Option<&Camera>,
@@ -49,12 +49,12 @@ pub(crate) fn undistorted(
     (reduced(image, size, sx, &source), camera)
 }
 
-/// A mask of the whole photograph in the pixels of the reduced one.
+/// A mask of the full photograph, resampled to the pixels of the reduced one.
 pub(crate) fn reduced_mask(mask: &Mask, photograph: &PosedPhotograph) -> Mask {
     of_size(mask, photograph.image.size())
 }
 
-/// A mask of the reduced photograph in the pixels of the camera that took it.
+/// A mask of the reduced photograph, resampled to the pixels of the original camera.
 pub(crate) fn enlarged_mask(mask: &Mask, photograph: &PosedPhotograph, camera: Option<&Camera>) -> Mask {
     let size = camera.map_or(photograph.image.size(), |c| (c.width, c.height));
     of_size(mask, size)

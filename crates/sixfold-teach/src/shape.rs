@@ -1,4 +1,4 @@
-//! Masks, and a mesh, of what all photographs show.
+//! Masks of the object in all photographs, and a mesh made from them.
 
 use rayon::prelude::*;
 use sixfold_board::Board;
@@ -19,49 +19,49 @@ use crate::stereo::{Reach, StereoOptions, depths};
 use crate::surface::surface;
 use crate::view::{PosedPhotograph, View, Volume};
 
-/// Fewest photographs a shape is made from.
+/// Minimum number of photographs for a shape.
 pub const FEWEST_PHOTOGRAPHS: usize = 4;
 /// The same with measured depth.
 pub const FEWEST_WITH_DEPTH: usize = 1;
-/// Two photographs have to be this far apart, seen from the object, degrees.
+/// Minimum angle between the directions from the object to two of the photographs, degrees.
 const APART: f64 = 50.0;
 /// A second part this large (fraction of the first) is a second object.
 const SECOND: f64 = 0.2;
-/// Parts whose boxes are this near are of one object, metres.
+/// Parts whose boxes are this close belong to the same object, metres.
 const TOGETHER: f64 = 0.015;
-/// Why a photograph is left out whose mask shows nothing.
+/// Why a photograph with an empty mask is left out.
 pub(crate) const NOT_IN_SIGHT: &str = "the object is not in sight";
-/// Overlap of a mask with what all others say, below which it contradicts them.
+/// Overlap of a mask with the shape from all others below which it contradicts them.
 const SAME: f64 = 0.7;
-/// How high above the board an object reaches at most, as a fraction of the sheet's longer side.
+/// Maximum height of an object above the board, as a fraction of the sheet's longer side.
 const HEIGHT: f64 = 1.0;
 /// Steps of a reconstruction that are reported.
 const SHAPE_STEPS: usize = 4;
-/// What touches the board within this height belongs to the table: flat shadows, the sheet's own thickness; metres.
+/// Everything up to this height above the board belongs to the table, such as flat shadows and the sheet's own thickness; metres.
 const TABLE: f64 = 0.0005;
 
-/// Longer side of a view while a mesh is laid into it, pixels.
+/// Longer side of a view while the pose of a given mesh is found, pixels.
 const LAID_SIDE: usize = 220;
 
-/// How far before and behind the hull depth is searched, metres.
+/// How far in front of and behind the hull depth is searched, metres.
 const BEYOND: f32 = 0.003;
 
-/// How finely is worked.
+/// Resolutions of the reconstruction.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ShapeOptions {
-    /// Pixels along the longer side of a view, when the object is looked for.
+    /// Pixels along the longer side of a view while the object is searched.
     pub coarse_side: usize,
-    /// The same, when its shape is made.
+    /// The same while its shape is made.
     pub fine_side: usize,
     /// Voxels along the longest side of the space that is searched.
     pub coarse_cells: usize,
     /// Voxels along the longest side of the object.
     pub fine_cells: usize,
-    /// The same, when photographs are compared with each other.
+    /// Pixels along the longer side of a view while photographs are compared with each other.
     pub stereo_side: usize,
-    /// Hollows are cut out where photographs show them.
+    /// Whether hollows are carved where photographs show them.
     pub stereo: bool,
-    /// Most faces of the mesh.
+    /// Maximum number of faces of the mesh.
     pub faces: usize,
 }
 
@@ -79,18 +79,18 @@ impl Default for ShapeOptions {
     }
 }
 
-/// Photographs of one object that stands still in the world.
+/// Photographs of one object that does not move in the world.
 #[derive(Debug, Clone)]
 pub struct Capture {
     /// The photographs.
     pub photographs: Vec<PosedPhotograph>,
     /// The board it stands on; the world is then the board's frame.
     pub board: Option<Board>,
-    /// The plane on which the object stands, its normal upwards; `None` where that is not known.
+    /// The plane on which the object stands, its normal upwards; `None` if unknown.
     pub floor: Option<Plane>,
-    /// Where is up. An object of which the floor is not known stands on the highest plane that the masks allow.
+    /// The up direction. If the floor is unknown, the object stands on the highest plane that the masks allow.
     pub up: Option<Vec3>,
-    /// Where the object is searched for; `None` to compute that from masks.
+    /// The volume in which the object is searched; `None` to compute it from masks.
     pub volume: Option<Volume>,
 }
 
@@ -114,7 +114,7 @@ impl Capture {
         Capture { photographs, board: None, floor, up: None, volume: None }
     }
 
-    /// Below this plane there is no object.
+    /// The plane below which there is no object.
     fn floor(&self) -> Option<Plane> {
         self.floor.map(|floor| Plane { offset: floor.offset + TABLE, ..floor })
     }
@@ -124,12 +124,13 @@ pub(crate) fn step(progress: &dyn Progress, done: usize, total: usize) -> Result
     if progress.report(done, total) { Ok(()) } else { Err(TeachError::Stopped) }
 }
 
-/// Where the photographs show the object.
+/// The object in the photographs: volume and masks.
 #[derive(Debug, Clone)]
 pub struct Segmentation {
-    /// The space that holds it.
+    /// The volume that contains it.
     pub volume: Volume,
-    /// For each photograph its mask, in the pixels of the whole photograph without lens distortion; `None` where it was not used.
+    /// For each photograph its mask, in the pixels of the whole photograph without lens distortion; `None` if the photograph was
+    /// not used.
     pub masks: Vec<Option<Mask>>,
     /// Photographs that are not used, and why.
     pub left_out: Vec<(usize, String)>,
@@ -138,17 +139,17 @@ pub struct Segmentation {
 /// A mesh made from photographs.
 #[derive(Debug, Clone)]
 pub struct Shape {
-    /// Closed, coloured, in metres; its frame has its origin in the middle of the mesh's box and the axes of the world.
+    /// Closed, coloured, in metres; its frame has its origin at the centre of the mesh's box and the axes of the world.
     pub mesh: Mesh,
     /// Takes points of the object's frame to the world.
     pub world_from_object: Pose,
     /// Fraction of the surface that no photograph shows.
     pub unseen: f64,
-    /// Fraction of the surface's pixels of all photographs whose depth was measured or found by comparison.
+    /// Fraction of the object's pixels in all photographs whose depth was measured or found by stereo comparison.
     pub with_depth: f64,
 }
 
-/// The views of those photographs that show a volume, with their numbers.
+/// The views of the photographs that show a volume, with their numbers.
 fn views_of(capture: &Capture, volume: &Volume, side: usize, used: &[usize]) -> Vec<(usize, View)> {
     let view = |i: &usize| View::new(&capture.photographs[*i], volume, side).map(|view| (*i, view));
     used.par_iter().filter_map(view).collect()
@@ -177,7 +178,7 @@ pub fn segment(
     }
     let all: Vec<usize> = (0..capture.photographs.len()).collect();
     let volume = rough_volume(capture, &searched, segmenter, options, progress)?;
-    // Once more in views of the object alone, with what is around it.
+    // Repeat in views of only the object and its surroundings.
     let around = volume.scaled(1.3).within(&searched);
     let views = views_of(capture, &around, options.fine_side, &all);
     let views = with_cues(views, capture, segmenter, progress, all.len())?;
@@ -280,7 +281,8 @@ fn rough_volume(
     Ok(found.within(searched))
 }
 
-/// Parts of a rough shape that lie apart, largest first: parts of one object may hang together by too little to be seen.
+/// Separate parts of a rough shape, largest first. Parts that are close together count as one object, because their connection
+/// may be too thin to be visible.
 fn objects(shape: &Grid) -> Vec<Vec<usize>> {
     let mut objects: Vec<(Volume, Vec<usize>)> = vec![];
     for part in shape.components() {
@@ -304,7 +306,7 @@ fn objects(shape: &Grid) -> Vec<Vec<usize>> {
     parts
 }
 
-/// The field with everything but its largest object outside.
+/// The field with only its largest object inside.
 fn only_largest(shape: &Grid) -> Option<Grid> {
     let parts = objects(shape);
     let first = parts.first()?;
@@ -316,7 +318,7 @@ fn only_largest(shape: &Grid) -> Option<Grid> {
 
 type Kept = Vec<(usize, View, Mask)>;
 
-/// Leaves out the photographs whose mask contradicts the others'.
+/// Leaves out the photographs whose masks contradict the others.
 fn consistent(
     views: &[(View, Cues)],
     found: Vec<Mask>,
@@ -331,7 +333,7 @@ fn consistent(
     for i in (0..views.len()).filter(|i| !used.contains(i)) {
         left_out.push((numbers[i], NOT_IN_SIGHT.to_owned()));
     }
-    // The shape of what is left decides again, as the first one is cut by a wrong mask too.
+    // Repeat with the shape from the remaining masks, since a wrong mask also carved the first one.
     for _ in 0..3 {
         let outlined: Vec<Outlined<'_>> =
             used.iter().map(|i| Outlined::new(&views[*i].0, &found[*i])).collect();
@@ -344,7 +346,7 @@ fn consistent(
         let Some(worst) = worst else { break };
         let bad = overlaps.iter().filter(|o| **o < SAME).count();
         if 2 * bad > used.len() {
-            // Which one is wrong cannot be told: leave out those that cut most, one after the other.
+            // It is unknown which one is wrong: leave out those that carve most, one after the other.
             let cutting = cutting_most(views, &found, &used).unwrap_or(worst);
             let number = numbers[used.remove(cutting)];
             left_out.push((number, "its mask cuts away what the others show".to_owned()));
@@ -362,7 +364,7 @@ fn consistent(
     Ok((kept, left_out))
 }
 
-/// The view whose mask is smallest against its box in the image: it cuts the hull most.
+/// The view whose mask is smallest relative to its box in the image: it carves the hull most.
 fn cutting_most(views: &[(View, Cues)], found: &[Mask], used: &[usize]) -> Option<usize> {
     let fraction = |k: usize| {
         let mask = &found[used[k]];
@@ -393,7 +395,7 @@ fn in_photograph(photograph: &PosedPhotograph, view: &View, mask: &Mask) -> Mask
     })
 }
 
-/// The same the other way.
+/// The inverse of [`in_photograph`].
 fn in_view(view: &View, photograph: &PosedPhotograph, mask: &Mask) -> Mask {
     let (c, v) = (&photograph.camera, &view.camera);
     Image::from_fn(v.width, v.height, |x, y| {
@@ -451,7 +453,7 @@ pub fn reconstruct(
     Ok(Shape { mesh, world_from_object, unseen: paint.unseen, with_depth })
 }
 
-/// One part of several: counts from where the part before ended.
+/// Progress of one part of several: it continues the count of the previous part.
 struct Part<'a> {
     whole: &'a dyn Progress,
     before: usize,
@@ -464,7 +466,7 @@ impl Progress for Part<'_> {
     }
 }
 
-/// Lays a mesh that is known already into photographs with masks; it keeps its frame, and its colours if it has any.
+/// Finds the pose of a given mesh in photographs with masks; the mesh keeps its frame, and its colours if it has any.
 ///
 /// # Errors
 /// [`TeachError`].
@@ -499,13 +501,13 @@ pub(crate) fn lay(
     Ok(Shape { mesh, world_from_object, unseen: paint.unseen, with_depth: hull.with_depth })
 }
 
-/// Depth of views, measured or found by comparison.
+/// Depth of views, measured or found by stereo comparison.
 struct KnownDepth {
     views: Vec<View>,
     depths: Vec<DepthImage>,
     /// How many views have to agree that a place is empty.
     least: f32,
-    /// Fraction of the masks' pixels that have it.
+    /// Fraction of the masks' pixels that have depth.
     fraction: f64,
 }
 
@@ -535,7 +537,7 @@ fn depth_of(
         let reaches: Vec<Reach> = views.par_iter().map(|view| reach(&mesh, view)).collect();
         depths(&views, &reaches, &StereoOptions::default())
     };
-    // What is beside the object is no depth of it.
+    // Keep only depth of the object, not of its surroundings.
     let depths: Vec<DepthImage> = all
         .iter()
         .zip(&masks)
@@ -552,7 +554,7 @@ fn depth_of(
     Some(KnownDepth { views, depths, least, fraction: known as f64 / pixels.max(1) as f64 })
 }
 
-/// Where the pixels of a view look into a closed mesh and first out of it again, and a little more.
+/// The depths at which the rays of a view's pixels enter a closed mesh and first leave it again, with a margin.
 fn reach(mesh: &Mesh, view: &View) -> Reach {
     let depth_of = |mesh: &Mesh| {
         let mut buffer = VisibilityBuffer::new(&view.camera);

@@ -1,7 +1,8 @@
-//! Where each photograph shows the object: salience, the board that is not covered, colours, and what all photographs agree on.
+//! The object's mask in each photograph, from salience, the uncovered parts of the board, colours, and the consensus of all
+//! photographs.
 //!
 //! Each cue gives log-odds for a pixel of a view. The sum is smoothed along the edges of the photograph (guided filter: He, Sun
-//! and Tang 2010), and a voxel belongs to the object where most of the views that show it say so.
+//! and Tang 2010), and a voxel belongs to the object if most of the views that show it vote for it.
 
 use rayon::prelude::*;
 use sixfold_board::Board;
@@ -12,21 +13,21 @@ use sixfold_nn::weights::WeightsError;
 use crate::grid::Grid;
 use crate::view::{View, Volume, bilinear};
 
-/// Largest log-odds of one cue: no cue alone is believed beyond 95 %.
+/// Largest log-odds of one cue: no single cue gives a probability above 95 %.
 const MOST: f32 = 3.0;
-/// Fraction of the views that show a voxel which may say that it is empty.
+/// Fraction of the views showing a voxel that may vote that it is empty.
 const DISSENT: f64 = 0.15;
 /// Radius of the guided filter, pixels, and its regularisation (squared grey levels from 0 to 1).
 const FILTER: (usize, f32) = (5, 1e-3);
 /// Bins per channel of the histograms of colours.
 const BINS: usize = 12;
 
-/// Sees what stands out in an image: for each pixel the probability that it belongs to the object. Sizes are equal.
+/// A network for salient regions: for each pixel of an image, the probability that it belongs to the object.
 pub trait Segmenter: Sync {
     /// Probabilities, 0 to 1, in an image of the same size.
     ///
     /// # Errors
-    /// What the network says.
+    /// The network's error.
     fn foreground(&self, image: &RgbImage) -> Result<Image<f32>, Box<dyn std::error::Error + Send + Sync>>;
 }
 
@@ -34,7 +35,7 @@ pub trait Segmenter: Sync {
 pub struct SalientSegmenter(SalientNetwork);
 
 impl SalientSegmenter {
-    /// With the weights that the program carries.
+    /// With the weights that are built into the program.
     ///
     /// # Errors
     /// The weights' error.
@@ -49,11 +50,11 @@ impl Segmenter for SalientSegmenter {
     }
 }
 
-/// What is known of one view.
+/// The cues of one view.
 pub(crate) struct Cues {
     /// Log-odds of salience.
     pub salience: Image<f32>,
-    /// Log-odds from the board; 0 where it says nothing.
+    /// Log-odds from the board; 0 where the board gives no information.
     pub board: Image<f32>,
 }
 
@@ -83,7 +84,7 @@ impl Cues {
         Ok(Cues { salience, board })
     }
 
-    /// Both together.
+    /// The sum of both.
     pub fn sum(&self) -> Image<f32> {
         let both = self.salience.as_slice().iter().zip(self.board.as_slice());
         let sum = both.map(|(a, b)| (0.7 * a + b).clamp(-2.0 * MOST, 2.0 * MOST)).collect();
@@ -97,20 +98,22 @@ fn grey([r, g, b]: [u8; 3]) -> f32 {
     0.299 * f32::from(r) + 0.587 * f32::from(g) + 0.114 * f32::from(b)
 }
 
-/// How often light on paper and ink is estimated again, from the pixels that agree with the board so far.
+/// Number of passes in which the brightness of paper and ink is estimated from the pixels that agree with the board so far.
 const PASSES: usize = 3;
-/// Half the side of the square in which agreement with the board counts, metres: wherever it lies, it holds paper and ink.
+/// Half the side of the square in which agreement with the board is averaged, metres: large enough to contain paper and ink
+/// everywhere.
 const SQUARE: f64 = 0.009;
-/// Fraction of agreeing pixels in a square that is certainly bare board, that says nothing, and that is certainly covered.
+/// Fractions of agreeing pixels in a square at which the board is certainly bare, at which nothing is known, and at which it is
+/// certainly covered.
 const AGREEMENT: [f32; 3] = [0.85, 0.6, 0.35];
-/// Fraction of a square below which its paper, or its ink, says nothing.
+/// Minimum fraction of paper, or of ink, in a square for it to count.
 const RARE: f32 = 0.03;
-/// How much darker than lit paper a shadow is at most.
+/// Brightness of the darkest shadow on paper, as a fraction of the way from ink to lit paper.
 const DARKEST_SHADOW: f32 = 0.3;
-/// Difference of colour channels from those of paper, as a fraction, above which a pixel is neither paper nor ink.
+/// Relative difference of the colour channels from those of paper above which a pixel is neither paper nor ink.
 const TINT: f32 = 0.25;
 
-/// Log-odds from whether a pixel and those around it look as the bare board would.
+/// Log-odds from the comparison of each pixel and its surroundings with the bare board.
 fn board_cue(view: &View, board: &Board) -> Image<f32> {
     let (width, height) = view.image.size();
     let printed = printed(view, board);
@@ -125,7 +128,7 @@ fn board_cue(view: &View, board: &Board) -> Image<f32> {
         agrees = Image::from_fn(width, height, |x, y| {
             printed[(x, y)].map_or(0.0, |white| light.agreement((x, y), view.image[(x, y)], white))
         });
-        // White things agree with paper and black ones with ink: the worse of both counts.
+        // White objects agree with paper and black ones with ink, so the lower of both agreements counts.
         let of = |ink: bool| {
             let chosen = printed.map(|p| f32::from(u8::from(p.is_some_and(|white| (white < 0.5) == ink))));
             let both = combined(&agrees, &chosen, |a, c| a * c);
@@ -146,17 +149,17 @@ fn board_cue(view: &View, board: &Board) -> Image<f32> {
         } else {
             2.0 * ((unknown - a) / (unknown - hidden)).min(1.0)
         };
-        // Where a square is partly covered the pixel itself decides.
+        // In a partly covered square the pixel itself decides.
         let of_pixel = if agrees[(x, y)] < 0.5 { 1.5 } else { -1.0 };
         (of_square + of_pixel).clamp(-4.0, MOST)
     })
 }
 
-/// What paper and ink look like around each pixel.
+/// The brightness of paper and ink around each pixel.
 struct Light {
     paper: Image<f32>,
     ink: Image<f32>,
-    /// Red and blue against green on paper.
+    /// Ratio of red and of blue to green on paper.
     tint: [f32; 2],
     contrast: Image<f32>,
 }
@@ -180,7 +183,7 @@ impl Light {
                 height,
                 |x, y| if enough[(x, y)] > 0.02 { near[(x, y)] } else { far[(x, y)] },
             );
-        // What hides ink is seldom as dark: how dark ink is is the same everywhere on the sheet.
+        // Occluders of ink are seldom as dark as ink; the ratio of ink to paper is the same everywhere on the sheet.
         let mut ratios = vec![];
         for y in 0..height {
             for x in 0..width {
@@ -208,7 +211,7 @@ impl Light {
         Light { paper, ink, tint, contrast }
     }
 
-    /// 1 where a pixel looks like the print, 0 where it does not.
+    /// 1 if a pixel agrees with the print, 0 if it does not.
     fn agreement(&self, at: (usize, usize), color: [u8; 3], white: f32) -> f32 {
         let (paper, ink) = (self.paper[at], self.ink[at]);
         let seen = grey(color);
@@ -218,7 +221,7 @@ impl Light {
         if tinted > TINT * paper.max(1.0) {
             return 0.0;
         }
-        // Noise, and an error of the board's place of a fraction of a pixel where ink meets paper.
+        // Noise, and an error of the board's pose by a fraction of a pixel at edges between ink and paper.
         let deviation = 12.0 + 0.25 * self.contrast[at] * (paper - ink).abs();
         let above = (seen - expected) / deviation;
         if above.abs() < 2.0 {
@@ -230,7 +233,7 @@ impl Light {
     }
 }
 
-/// How white the board is at each pixel, 0 to 1; `None` where the view does not look at it.
+/// How white the board is at each pixel, 0 to 1; `None` at pixels outside the board.
 fn printed(view: &View, board: &Board) -> Image<Option<f32>> {
     let (width, height) = view.image.size();
     let world_from_camera = view.camera_from_world.inverse();
@@ -255,7 +258,7 @@ fn printed(view: &View, board: &Board) -> Image<Option<f32>> {
     })
 }
 
-/// The mean of a square around each pixel, of the pixels that there are, by running sums.
+/// The mean over the square around each pixel, clipped to the image, by running sums.
 pub(crate) fn box_mean(image: &Image<f32>, radius: usize) -> Image<f32> {
     let (width, height) = image.size();
     let mut rows = image.clone();
@@ -269,7 +272,7 @@ pub(crate) fn box_mean(image: &Image<f32>, radius: usize) -> Image<f32> {
             *value = ((sums[to] - sums[from]) / (to - from) as f64) as f32;
         }
     }
-    // Downwards all columns at once.
+    // Vertically, for all columns at once.
     let mut out = image.clone();
     let mut sums = vec![0.0f64; width];
     let line = |y: usize| &rows.as_slice()[y * width..(y + 1) * width];
@@ -309,7 +312,7 @@ fn guided(p: &Image<f32>, image: &RgbImage) -> Image<f32> {
     combined(&combined(&mean_a, &guide, |a, i| a * i), &mean_b, |ai, b| (ai + b).clamp(0.0, 1.0))
 }
 
-/// The part of space that the views agree on, from log-odds: below zero where it belongs to the object.
+/// A field from the consensus of the views, from log-odds: below zero where a voxel belongs to the object.
 pub(crate) fn consensus(
     views: &[(View, Image<f32>)],
     volume: &Volume,
@@ -334,7 +337,7 @@ pub(crate) fn consensus(
     grid.smoothed(0.7)
 }
 
-/// Histograms of the colours of the object and of what is beside it.
+/// Histograms of the colours of the object and of its surroundings.
 struct Colors {
     object: Vec<f32>,
     beside: Vec<f32>,
@@ -375,7 +378,7 @@ pub(crate) fn mask(view: &View, cues: &Cues, shape: &Grid) -> Mask {
         return mask.clone();
     }
     let covered = covered(view, shape);
-    // Two voxels: what the rough shape may be off by.
+    // The possible error of the rough shape: two voxels.
     let margin =
         (2.5 * shape.step * view.camera.fx / (view.eye - shape_centre(shape)).norm()).ceil() as usize;
     let grown = covered.grown(margin.max(2));

@@ -1,7 +1,7 @@
-//! Simulated photographs of an object on the board, with exact truth: for tests, and to try a way of taking photographs.
+//! Simulated photographs of an object on the board, with exact ground truth: for tests, and to try ways of taking photographs.
 //!
-//! Rendered: the printed board, or a patterned cloth, on a table, the object with a shadow, a lamp that changes from photograph to photograph. Then the
-//! lens's distortion, blur, motion, noise; the caller may store them as JPEG.
+//! Rendered are the printed board or a patterned cloth on a table, and the object with a shadow; the lamp changes from photograph
+//! to photograph. Then lens distortion, blur, motion and noise are applied; the caller may store the images as JPEG.
 
 use rayon::prelude::*;
 use sixfold_board::Board;
@@ -17,14 +17,14 @@ use crate::view::bilinear_rgb;
 /// How much more than the camera's image is rendered on each side, as a fraction of its size.
 const MARGIN: f64 = 0.05;
 
-/// How photographs are taken.
+/// Options of the simulated photographs.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SimulationOptions {
     /// Number of photographs, in two circles of different height.
     pub photographs: usize,
     /// The camera, with its distortion.
     pub camera: Camera,
-    /// Distance from the object, metres, least and most.
+    /// Minimum and maximum distance from the object, metres.
     pub distance: [f64; 2],
     /// Standard deviation of blur, pixels.
     pub blur: f64,
@@ -32,7 +32,7 @@ pub struct SimulationOptions {
     pub motion: f64,
     /// Standard deviation of noise, grey levels.
     pub noise: f64,
-    /// The object turns with the board by this much in all about the vertical axis, degrees: 360 all around.
+    /// Total rotation of object and board about the vertical axis, degrees: 360 for all sides.
     pub around: f64,
 }
 
@@ -53,11 +53,11 @@ impl Default for SimulationOptions {
     }
 }
 
-/// A capture whose truth is known.
+/// A capture with known ground truth.
 pub struct SimulatedCapture<'a> {
     /// The camera's true poses.
     pub camera_from_board: Vec<Pose>,
-    /// Where the object stands.
+    /// The object's pose on the board.
     pub board_from_object: Pose,
     scene: Scene<'a>,
     options: &'a SimulationOptions,
@@ -65,7 +65,8 @@ pub struct SimulatedCapture<'a> {
 }
 
 impl<'a> SimulatedCapture<'a> {
-    /// An object that stands upright (its z axis up) on a board. `ground` is what the table looks like. Same seed, same images.
+    /// An object that stands upright (its z axis up) on a board. `ground` is the texture of the table. The same seed gives the same
+    /// images.
     pub fn new(
         mesh: &'a Mesh,
         board: &Board,
@@ -78,8 +79,8 @@ impl<'a> SimulatedCapture<'a> {
         SimulatedCapture::on_sheet(mesh, sheet, ground, options, seed)
     }
 
-    /// An object that stands on a square cloth in place of a board: `cloth` covers `side` metres, for example
-    /// [`patterned`]. Same seed, same images; poses are those of [`SimulatedCapture::new`].
+    /// An object that stands on a square cloth instead of a board: `cloth` covers `side` metres, for example [`patterned`]. The
+    /// same seed gives the same images; poses are those of [`SimulatedCapture::new`].
     pub fn without_board(
         mesh: &'a Mesh,
         (cloth, side): (&RgbImage, f64),
@@ -127,7 +128,7 @@ impl<'a> SimulatedCapture<'a> {
         Some(self.scene.photograph(pose, self.options, stream(self.seed, 1000 + number as u64)))
     }
 
-    /// Depth from the same place, metres, without lens distortion and noise; `None` beyond the last.
+    /// Depth from the same camera pose, metres, without lens distortion and noise; `None` beyond the last.
     pub fn depth(&self, number: usize) -> Option<DepthImage> {
         let pose = self.camera_from_board.get(number)?;
         let mut buffer = VisibilityBuffer::new(&self.options.camera.without_distortion());
@@ -135,7 +136,7 @@ impl<'a> SimulatedCapture<'a> {
         Some(buffer.depth())
     }
 
-    /// Where it shows the object, without lens distortion; `None` beyond the last.
+    /// The object's mask in a photograph, without lens distortion; `None` beyond the last.
     pub fn mask(&self, number: usize) -> Option<Mask> {
         let camera_from_object = compose(self.camera_from_board.get(number)?, &self.board_from_object);
         let mut buffer = VisibilityBuffer::new(&self.options.camera);
@@ -161,7 +162,7 @@ pub(crate) fn looking_at(target: &Vec3, azimuth: f64, elevation: f64, distance: 
     Pose::new(rotation, -(rotation * eye))
 }
 
-/// What stands where.
+/// The rendered scene.
 struct Scene<'a> {
     object: &'a Mesh,
     sheet: Mesh,
@@ -203,7 +204,7 @@ impl<'a> Scene<'a> {
         options: &SimulationOptions,
         mut random: sixfold_geometry::random::Random,
     ) -> RgbImage {
-        // Wider than the camera, so that the lens's distortion has something to look at; twice as fine.
+        // Wider than the camera's image, so that the distorted image is filled to its borders, and with twice the resolution.
         let lens = &options.camera;
         let (width, height) = (lens.width as f64, lens.height as f64);
         let pinhole = Camera {
@@ -253,7 +254,7 @@ impl<'a> Scene<'a> {
         exposed(&soft, lens, options.noise, random)
     }
 
-    /// Where the board lies in the object's shadow.
+    /// The part of the board in the object's shadow.
     fn shadow(&self, sun: &Vec3) -> Shadow {
         let flat = self.object.vertices().iter().map(|v| {
             let p = self.board_from_object.transform_point(v);
@@ -298,7 +299,7 @@ impl Shadow {
     }
 }
 
-/// The way of half the motion in the finer image, pixels.
+/// Half the motion in the finer image, pixels.
 fn motion_step(most: f64, random: &mut sixfold_geometry::random::Random) -> Vec2 {
     let length = most * f64::from(uniform(random, [0.0, 1.0]));
     let angle = f64::from(uniform(random, [0.0, std::f32::consts::TAU]));
@@ -333,7 +334,7 @@ fn blurred(image: &RgbImage, deviation: f64, motion: Vec2) -> [Image<f32>; 3] {
     })
 }
 
-/// The image behind the lens, with noise.
+/// The image with lens distortion and noise.
 fn exposed(
     soft: &[Image<f32>; 3],
     lens: &Camera,

@@ -1,6 +1,6 @@
-//! What a folder of a teaching holds, as one reads it: also while another process, or another thread, works there.
+//! A read-only view of a teaching's folder, also while another process or thread works there.
 //!
-//! `teaching.json` is replaced as a whole after each step, so what is read is the state after one of them.
+//! `teaching.json` is replaced as a whole after each step, so a reader gets the state after one of the steps.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -20,41 +20,42 @@ use crate::teaching::{By, Photograph, ShapeFacts, TeachOptions, World};
 use crate::unboarded::KnownLength;
 use crate::view::PosedPhotograph;
 
-/// The only version of `teaching.json` there is.
+/// The only version of `teaching.json`.
 pub(crate) const VERSION: u32 = 1;
-/// Longer side at which photographs are worked on, pixels.
+/// Longer side of photographs during processing, pixels.
 const SIDE: usize = 2048;
 
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct State {
     pub version: u32,
-    /// What the ruler on the printed board measures, metres.
+    /// Measured length of the ruler on the printed board, metres.
     pub ruler: Option<f64>,
     /// What the poses are relative to.
     #[serde(default)]
     pub world: World,
     /// A camera that was given.
     pub given_camera: Option<Camera>,
-    /// A length that was given, where there is no board.
+    /// A given length, for photographs without a board.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub length: Option<KnownLength>,
     pub photographs: Vec<Photograph>,
-    /// How often something was changed.
+    /// Number of changes.
     #[serde(default)]
     pub revision: u64,
-    /// What was found: paper, unless there is no board; camera; error in pixels.
+    /// Results: the paper, if there is a board; the camera; the error in pixels.
     pub located: Option<(Option<Paper>, Camera, f64)>,
-    /// The plane on which the object stands, where there is no board: its normal, and its distance from the origin along it, metres.
+    /// The plane on which the object stands, without a board: its normal, and its distance from the origin along the normal,
+    /// metres.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub floor: Option<[f64; 4]>,
-    /// Where is up, where somebody said so.
+    /// The up direction, if given.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub up: Option<[f64; 3]>,
-    /// The space that holds the object: least and largest coordinates.
+    /// The volume that contains the object: smallest and largest coordinates.
     pub volume: Option<[[f64; 3]; 2]>,
     pub shape: Option<ShapeFacts>,
-    /// That of the mesh which lies in the folder but was made before a correction: to correct more by.
+    /// The shape of the mesh in the folder if it was made before a correction; it helps with further corrections.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub outdated: Option<ShapeFacts>,
     /// Hash of a mesh that was given.
@@ -62,7 +63,7 @@ pub(crate) struct State {
     pub given_mesh: Option<u64>,
 }
 
-/// What is known of a teaching at one moment.
+/// The state of a teaching at one moment.
 #[derive(Debug, Clone)]
 pub struct Snapshot {
     pub(crate) folder: PathBuf,
@@ -132,7 +133,7 @@ impl Snapshot {
         Some(self.state.ruler.and_then(|ruler| board.with_ruler(ruler)).unwrap_or(board))
     }
 
-    /// The plane on which the object stands, where there is no board and if it is known.
+    /// The plane on which the object stands, without a board and if known.
     pub fn floor(&self) -> Option<Plane> {
         self.state.floor.map(|[x, y, z, offset]| Plane { normal: Vec3::new(x, y, z), offset })
     }
@@ -191,7 +192,7 @@ impl Snapshot {
         Ok((capture, numbers))
     }
 
-    /// What is known of the mesh, once it is made.
+    /// Data of the mesh, once it is made.
     pub fn shape(&self) -> Option<&ShapeFacts> {
         self.state.shape.as_ref()
     }
@@ -262,12 +263,12 @@ impl Snapshot {
         })
     }
 
-    /// What is known of the mesh that was made last, also one that corrections have outdated.
+    /// Data of the mesh that was made last, even if corrections have outdated it.
     pub fn last_shape(&self) -> Option<&ShapeFacts> {
         self.state.shape.as_ref().or(self.state.outdated.as_ref())
     }
 
-    /// The mesh that was made last, and where it stands on the board; also one that corrections have outdated.
+    /// The mesh that was made last and its pose on the board, even if corrections have outdated it.
     ///
     /// # Errors
     /// [`TeachError`].
@@ -276,23 +277,23 @@ impl Snapshot {
         Ok(Some((self.mesh_file()?, self.pose_of(shape)?)))
     }
 
-    /// What it was begun with.
+    /// The options with which the teaching was started.
     pub fn options(&self) -> TeachOptions {
         TeachOptions { ruler: self.state.ruler, camera: self.state.given_camera, world: self.state.world }
     }
 
-    /// A number that is another one after each change.
+    /// A number that differs after each change.
     pub fn revision(&self) -> u64 {
         self.state.revision
     }
 
-    /// Root of the mean squared distance of the tags' corners from where the board has them, pixels; once poses are found.
+    /// Root mean square distance of the detected tag corners to the projected corners of the board, pixels; once poses are found.
     pub fn rms(&self) -> Option<f64> {
         self.state.located.as_ref().map(|(_, _, rms)| *rms)
     }
 
-    /// A photograph without lens distortion, at most `side` pixels wide and high, with its camera; as it is and without one, as long as
-    /// the camera is not known or is that of another size.
+    /// A photograph without lens distortion, at most `side` pixels wide and high, with its camera; unchanged and without a camera
+    /// if the camera is unknown or for another image size.
     ///
     /// # Errors
     /// [`TeachError::NoPhotograph`], [`TeachError::Image`].
@@ -302,7 +303,7 @@ impl Snapshot {
         Ok(crate::reduce::undistorted(&image, lens, side))
     }
 
-    /// What [`Snapshot::image`] shows, with the border of the mask and the outline of the mesh that was made last.
+    /// The image of [`Snapshot::image`], with the border of the mask and the outline of the mesh that was made last.
     ///
     /// # Errors
     /// [`TeachError`].
@@ -311,7 +312,7 @@ impl Snapshot {
         Ok(crate::pictures::outlined(&image, mask.as_ref(), outline.as_ref()))
     }
 
-    /// The same of the object and its surroundings alone, `side` pixels wide and high.
+    /// The same for a crop of the object and its surroundings, `side` pixels wide and high.
     ///
     /// # Errors
     /// [`TeachError`].
@@ -320,7 +321,7 @@ impl Snapshot {
         Ok(crate::pictures::close_up(&image, mask.as_ref(), outline.as_ref(), side))
     }
 
-    /// A photograph as [`Snapshot::image`] has it, its mask, and the pixels that the mesh covers.
+    /// A photograph as in [`Snapshot::image`], its mask, and the pixels that the mesh covers.
     fn outlines(&self, number: usize, side: usize) -> Result<Outlines, TeachError> {
         let (image, camera) = self.image(number, side)?;
         let mask = self.mask(number)?.map(|mask| crate::reduce::of_size(&mask, image.size()));

@@ -1,8 +1,8 @@
-//! The plane on which an object stands, where up is known and the plane is not.
+//! The plane on which an object stands, if only the up direction is known.
 //!
-//! No photograph is taken from below, so the hull continues under the object as a wedge. Whatever the object stands on, it touches: the
-//! plane is moved up as far as the masks allow. A pixel that shows the object allows it as far as the highest point of the hull on its
-//! ray.
+//! No photograph is taken from below, so the hull continues under the object as a wedge. The object touches the plane that it
+//! stands on, so the plane is moved up as far as the masks allow. A pixel that shows the object allows heights up to the highest
+//! point of the hull on its ray.
 
 use sixfold_geometry::{Image, Mask, Plane, Vec3};
 
@@ -28,7 +28,7 @@ pub(crate) fn standing(hull: Grid, views: &[View], masks: &[Mask], up: &Vec3) ->
     cut
 }
 
-/// How far up a mask allows the plane; `None` where it shows nothing.
+/// The largest height of the plane that a mask allows; `None` if the mask shows nothing.
 fn allowed_by(hull: &Grid, view: &View, mask: &Mask, up: &Vec3) -> Option<f64> {
     let (width, height) = view.image.size();
     let mut highest = Image::filled(width, height, f64::NEG_INFINITY);
@@ -75,7 +75,7 @@ mod tests {
         Mesh::new((0..8).map(corner).collect(), faces).unwrap()
     }
 
-    /// Lowest and highest point of what is inside.
+    /// Heights of the lowest and highest inside points.
     fn heights(grid: &Grid) -> [f64; 2] {
         let inside = (0..grid.values.len()).filter(|i| grid.values[*i] < 0.0);
         let z = inside.map(|i| grid.point(grid.place(i)).z);
@@ -86,7 +86,7 @@ mod tests {
     fn the_wedge_under_an_object_goes_and_the_object_stays() {
         let camera =
             Camera { fx: 500.0, fy: 500.0, cx: 119.5, cy: 119.5, width: 240, height: 240, distortion: None };
-        // All from one half, so that little bounds the wedge.
+        // All from one half, so that the wedge is hardly limited.
         let poses = [-60.0, -20.0, 20.0, 60.0].into_iter().enumerate().map(|(i, azimuth)| {
             looking_at(&Vec3::new(0.0, 0.0, 0.03), azimuth, 35.0 + 5.0 * i as f64, 0.5, 0.0)
         });

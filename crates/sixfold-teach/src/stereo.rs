@@ -9,13 +9,13 @@ use crate::view::{View, bilinear};
 
 /// Options of the sweep.
 pub(crate) struct StereoOptions {
-    /// Number of depths between front and back of the hull.
+    /// Number of depth planes between front and back of the hull.
     pub planes: usize,
     /// Neighbours that a view is compared with.
     pub neighbours: usize,
     /// Half the side of a window, pixels.
     pub radius: usize,
-    /// Correlation from which a depth is believed.
+    /// Minimum correlation for a depth to be accepted.
     pub correlation: f32,
     /// Standard deviation of grey levels in a window below which nothing can be compared.
     pub contrast: f32,
@@ -23,18 +23,18 @@ pub(crate) struct StereoOptions {
 
 impl Default for StereoOptions {
     fn default() -> Self {
-        // By hand on simulated captures of other objects than those that are reported on.
+        // Chosen by hand on simulated captures of other objects than the reported ones.
         StereoOptions { planes: 48, neighbours: 4, radius: 3, correlation: 0.8, contrast: 7.0 }
     }
 }
 
-/// The depths of the hull that each pixel of a view looks through.
+/// The range of depths at which each pixel's ray is inside the hull.
 pub(crate) struct Reach {
     pub front: DepthImage,
     pub back: DepthImage,
 }
 
-/// A depth image for each view, 0 where no depth is believed.
+/// A depth image for each view, 0 where no depth is accepted.
 pub(crate) fn depths(views: &[View], reaches: &[Reach], options: &StereoOptions) -> Vec<DepthImage> {
     let greys: Vec<Image<f32>> = views.iter().map(|v| v.image.map(|c| luminance(*c))).collect();
     let swept: Vec<DepthImage> = (0..views.len())
@@ -107,7 +107,7 @@ fn sweep(
         if top < options.correlation || own.deviation.as_slice()[k] < options.contrast {
             return 0.0;
         }
-        // The peak of the parabola through the three scores; a peak at the end of the reach is none.
+        // The peak of the parabola through the three scores; a maximum at the end of the range is not a peak.
         if !(left.is_finite() && right.is_finite()) {
             return 0.0;
         }
@@ -117,7 +117,7 @@ fn sweep(
     })
 }
 
-/// The depth a fraction of the way from front to back, evenly in 1/depth; 0 beside the hull.
+/// The depth at a fraction of the way from front to back, uniform in 1/depth; 0 outside the hull.
 fn at_plane(reach: &Reach, pixel: (usize, usize), fraction: f32) -> f32 {
     let (front, back) = (reach.front[pixel], reach.back[pixel]);
     if front <= 0.0 || back <= front {
@@ -126,7 +126,7 @@ fn at_plane(reach: &Reach, pixel: (usize, usize), fraction: f32) -> f32 {
     1.0 / ((1.0 - fraction) / front + fraction / back)
 }
 
-/// The mean of the better half: a neighbour may see something else before it.
+/// The mean of the better half, since the view of a neighbour may be occluded.
 fn best_half(scores: impl Iterator<Item = f32>) -> f32 {
     let mut scores: Vec<f32> = scores.collect();
     scores.sort_by(|a, b| b.total_cmp(a));
@@ -134,7 +134,8 @@ fn best_half(scores: impl Iterator<Item = f32>) -> f32 {
     scores[..half].iter().sum::<f32>() / half as f32
 }
 
-/// What another view shows at the points of this view's pixels at a depth; NaN where it shows none.
+/// The grey levels of another view at the points of this view's pixels with given depths; NaN for points outside its
+/// image.
 fn warped(views: &[View], greys: &[Image<f32>], (i, j): (usize, usize), depth: &DepthImage) -> Image<f32> {
     let (here, there) = (&views[i], &views[j]);
     let relative = there.camera_from_world.to_matrix() * here.camera_from_world.inverse().to_matrix();
@@ -199,7 +200,7 @@ fn correlation(
     })
 }
 
-/// The depths of a view that two others confirm to a fraction of the depth.
+/// The depths of a view that two other views confirm within a fraction of the depth.
 fn agreed(views: &[View], depths: &[DepthImage], i: usize, options: &StereoOptions) -> DepthImage {
     /// 1.5 mm at 50 cm.
     const SAME: f64 = 0.003;

@@ -1,4 +1,4 @@
-//! The surface on which a field on a grid is zero, as a closed mesh: surface nets (Gibson 1998).
+//! The zero level set of a field on a grid as a closed mesh, by surface nets (Gibson 1998).
 
 use std::collections::BTreeMap;
 
@@ -7,7 +7,7 @@ use sixfold_mesh::Mesh;
 
 use crate::grid::Grid;
 
-/// The surface around the largest part in which the field is below zero; `None` where there is none. Beyond the grid the field
+/// The surface around the largest part in which the field is below zero; `None` if there is none. Outside the grid the field
 /// counts as above zero, so the surface is closed.
 pub(crate) fn surface(grid: &Grid) -> Option<Mesh> {
     let grid = &closed(grid);
@@ -50,7 +50,7 @@ fn closed(grid: &Grid) -> Grid {
     padded
 }
 
-/// The mean of the places where the edges of a cell cross zero.
+/// The mean of the zero crossings on the edges of a cell.
 fn vertex_of(grid: &Grid, [x, y, z]: [usize; 3]) -> Option<Vec3> {
     let corner = |i: usize| [x + (i & 1), y + (i >> 1 & 1), z + (i >> 2 & 1)];
     let values: [f32; 8] = std::array::from_fn(|i| grid.values[grid.index(corner(i))]);
@@ -103,7 +103,7 @@ fn quad(grid: &Grid, numbers: &[u32], place: [usize; 3], axis: usize, faces: &mu
     }
 }
 
-/// The part with most faces; what is connected shares a vertex.
+/// The connected part with most faces; connected faces share a vertex.
 fn largest_part(mesh: &Mesh) -> Option<Mesh> {
     let mut parent: Vec<u32> = (0..mesh.vertices().len() as u32).collect();
     fn root(parent: &mut [u32], mut i: u32) -> u32 {

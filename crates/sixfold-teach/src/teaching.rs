@@ -1,5 +1,5 @@
-//! A folder in which an object is taught: photographs go in, every step's result is kept, so that a killed run resumes, and a person can
-//! inspect and correct each step.
+//! A folder in which an object is taught: photographs are added and every step's result is kept, so that an interrupted run can be
+//! resumed and a person can inspect and correct each step.
 //!
 //! | file | what it holds |
 //! |---|---|
@@ -32,7 +32,7 @@ use crate::silhouette::Segmenter;
 use crate::snapshot::{Snapshot, State, VERSION};
 use crate::view::Volume;
 
-/// Most photographs.
+/// Maximum number of photographs.
 pub const MOST_PHOTOGRAPHS: usize = 200;
 /// The file of a mesh that was given.
 const GIVEN_MESH: &str = "given.ply";
@@ -41,9 +41,9 @@ const GIVEN_MESH: &str = "given.ply";
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum By {
-    /// Found.
+    /// Found by the program.
     Program,
-    /// Given, or corrected.
+    /// Given or corrected by a person.
     Person,
 }
 
@@ -73,7 +73,7 @@ pub struct Photograph {
     /// Why it is not used.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub left_out: Option<String>,
-    /// Somebody said not to use it.
+    /// Whether a person excluded it.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub left_out_by_person: bool,
 }
@@ -86,7 +86,7 @@ impl Photograph {
     }
 }
 
-/// What is known of the mesh.
+/// Data of the mesh.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ShapeFacts {
@@ -94,7 +94,7 @@ pub struct ShapeFacts {
     pub board_from_object: [[f64; 4]; 4],
     /// Fraction of the surface that no photograph shows.
     pub unseen: f64,
-    /// Fraction of the object's pixels with depth, measured or by comparison of photographs.
+    /// Fraction of the object's pixels with depth, measured or by stereo comparison of photographs.
     pub with_depth: f64,
 }
 
@@ -105,17 +105,17 @@ pub enum World {
     /// The printed board, which the photographs show.
     #[default]
     Board,
-    /// Poses are given with [`Teaching::set_pose`], in a frame of the giver's choice.
+    /// Poses are given with [`Teaching::set_pose`], in a frame of the caller's choice.
     Given,
-    /// What is around the object, which has to have texture: poses are found from local features, metres from
-    /// [a length](Teaching::set_length) or from depth. z points up.
+    /// The surroundings of the object, which must have texture: poses are found from local features, and the scale from [a
+    /// length](Teaching::set_length) or from depth. z points up.
     Features,
 }
 
-/// What is known before the first photograph.
+/// Options that are set before the first photograph.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct TeachOptions {
-    /// What the ruler on the printed board measures, metres; `None` for 0.1.
+    /// Measured length of the ruler on the printed board, metres; `None` for 0.1.
     pub ruler: Option<f64>,
     /// The camera; `None` to find it from the photographs.
     pub camera: Option<Camera>,
@@ -138,12 +138,12 @@ impl Deref for Teaching {
     }
 }
 
-/// A value as it is read again from the file: the last digit of a number may be another one.
+/// A value as it is after writing to and reading from the file: the last digit of a number may differ.
 fn as_kept<T: Serialize + DeserializeOwned>(value: &T) -> Option<T> {
     serde_json::from_str(&serde_json::to_string(value).ok()?).ok()
 }
 
-/// Whether two values are the same once both were kept.
+/// Whether two values are equal after writing and reading.
 pub(crate) fn is_same<T: Serialize + DeserializeOwned + PartialEq>(a: &T, b: &T) -> bool {
     a == b
         || as_kept(a) == as_kept(b)
@@ -157,7 +157,7 @@ pub(crate) fn rows(pose: &Pose) -> [[f64; 4]; 4] {
 }
 
 impl Teaching {
-    /// Opens the folder, or begins in a new one. Options that differ from those that it was begun with begin the steps again.
+    /// Opens or creates the folder. If the options differ from those with which it was created, all steps are repeated.
     ///
     /// # Errors
     /// [`TeachError::File`], [`TeachError::Io`].
@@ -210,14 +210,14 @@ impl Teaching {
         write_atomically(&path, text.as_bytes()).map_err(|source| TeachError::Io { path, source })
     }
 
-    /// Adds a photograph from the bytes of a PNG or JPEG file; its number. A name that is there already is taken once: the same
-    /// bytes again change nothing, others replace it.
+    /// Adds a photograph from the bytes of a PNG or JPEG file and returns its number. If the name exists already, equal bytes
+    /// change nothing and different bytes replace the photograph.
     ///
     /// # Errors
-    /// [`TeachError::Image`] for bytes that are none, [`TeachError::Io`].
+    /// [`TeachError::Image`] for bytes that are not an image, [`TeachError::Io`].
     pub fn add_photograph(&mut self, name: &str, bytes: &[u8]) -> Result<usize, TeachError> {
         let name: String = name.chars().filter(|c| !c.is_control()).take(200).collect();
-        // Refused before anything is kept.
+        // Refuse invalid images before anything is stored.
         let size = ImageFile::of_bytes(Path::new(&name), bytes).rgb()?.size();
         let png = bytes.starts_with(b"\x89PNG");
         let there = self.known.state.photographs.iter().position(|p| p.name == name);
@@ -256,7 +256,7 @@ impl Teaching {
         Ok(number)
     }
 
-    /// Adds measured depth to a photograph: a PNG of 16 bits of the same size, from the same place.
+    /// Adds measured depth to a photograph: a PNG of 16 bits of the same size, from the same camera pose.
     ///
     /// # Errors
     /// [`TeachError`].
@@ -286,7 +286,7 @@ impl Teaching {
         self.save()
     }
 
-    /// Finds camera and poses, unless that is done.
+    /// Finds camera and poses, unless they were found already.
     ///
     /// # Errors
     /// [`TeachError`].
@@ -304,7 +304,7 @@ impl Teaching {
         }
     }
 
-    /// Poses are those that were given.
+    /// Takes the given poses.
     fn take_given_poses(&mut self) -> Result<(), TeachError> {
         let camera = self.known.state.given_camera.ok_or(TeachError::Order { missing: "give the camera" })?;
         for photograph in &mut self.known.state.photographs {
@@ -354,7 +354,7 @@ impl Teaching {
         self.save()
     }
 
-    /// Finds the object in the photographs, unless that is done.
+    /// Finds the object in the photographs, unless it was found already.
     ///
     /// # Errors
     /// [`TeachError`].
@@ -379,7 +379,7 @@ impl Teaching {
                 let path = self.known.folder.join("masks").join(format!("{number:06}.png"));
                 sixfold_io::make_folder_of(&path)
                     .map_err(|source| TeachError::Io { path: path.clone(), source })?;
-                // Of the whole photograph, as somebody who corrects it would give it.
+                // A mask of the whole photograph, as a person would correct it.
                 let whole = crate::reduce::enlarged_mask(
                     mask,
                     photograph,
@@ -396,13 +396,13 @@ impl Teaching {
         self.save()
     }
 
-    /// How many photographs are needed at least.
+    /// Minimum number of photographs.
     fn fewest(&self) -> usize {
         let with_depth = self.photographs().iter().any(|p| p.depth.is_some() && !p.left_out_by_person);
         if with_depth { FEWEST_WITH_DEPTH } else { FEWEST_PHOTOGRAPHS }
     }
 
-    /// Says why photographs are not used, where there are too few.
+    /// Adds the reasons why photographs are not used to an error about too few.
     fn with_reasons(&self, error: TeachError) -> TeachError {
         match error {
             TeachError::TooFewPhotographs { found, least, .. } => {
@@ -417,7 +417,7 @@ impl Teaching {
         }
     }
 
-    /// Makes the mesh, unless that is done.
+    /// Makes the mesh, unless it was made already.
     ///
     /// # Errors
     /// [`TeachError`].
@@ -471,7 +471,7 @@ impl Teaching {
         self.save()
     }
 
-    /// Gives the object's mesh, metres: it is laid into the photographs in place of one that is made of them. `None` takes it back.
+    /// Sets the object's mesh, metres: its pose in the photographs is found, instead of making a mesh from them. `None` removes it.
     ///
     /// # Errors
     /// [`TeachError::File`], [`TeachError::Io`].
@@ -498,7 +498,7 @@ impl Teaching {
         read_mesh(&path, Unit::Metre).map(Some).map_err(|e| TeachError::File { path, what: e.to_string() })
     }
 
-    /// Corrects a pose: where the camera was. Masks and mesh are made again.
+    /// Corrects the pose of a photograph. Masks and mesh are made again.
     ///
     /// # Errors
     /// [`TeachError::NoPhotograph`], [`TeachError::Io`]; [`TeachError::File`] for a photograph of another size than the camera's.
@@ -523,8 +523,8 @@ impl Teaching {
         self.save()
     }
 
-    /// Says where is up, and on which plane the object stands, in the frame of poses that are given: nothing of the object is below.
-    /// Where up is known alone, it stands on the highest plane that the masks allow.
+    /// Sets the up direction and the plane on which the object stands, in the frame of the given poses; nothing of the object is
+    /// below the plane. If only `up` is given, the object stands on the highest plane that the masks allow.
     ///
     /// # Errors
     /// [`TeachError::Io`].
@@ -540,7 +540,7 @@ impl Teaching {
     }
 
     /// Corrects a mask, of the photograph's size, without lens distortion; `hidden` is the part of it where something may hide the
-    /// object. The mesh is made again; the masks of other photographs only where this one reaches beyond the space in which the
+    /// object. The mesh is made again; the masks of other photographs only if this one extends beyond the volume in which the
     /// object was found.
     ///
     /// # Errors
@@ -576,7 +576,7 @@ impl Teaching {
         self.save()
     }
 
-    /// Whether the space in which the object was found can hold all that a mask shows.
+    /// Whether everything in a mask can be inside the volume in which the object was found.
     fn is_within(&self, number: usize, mask: &Mask) -> bool {
         let known = (self.camera(), self.camera_from_board(number), self.known.state.volume);
         let (Some(camera), Some(pose), Some([low, high])) = known else { return false };
@@ -593,7 +593,7 @@ impl Teaching {
             && bottom <= high.y + margin
     }
 
-    /// Uses a photograph, or does not. The mesh is made again; the masks where this photograph has none.
+    /// Includes or excludes a photograph. The mesh is made again; the masks are made again if this photograph has none.
     ///
     /// # Errors
     /// [`TeachError::NoPhotograph`], [`TeachError::Io`].
@@ -608,7 +608,7 @@ impl Teaching {
         self.save()
     }
 
-    /// Takes back what a person said of a photograph; what depended on it is found again.
+    /// Removes a person's corrections of a photograph; results that depend on them are computed again.
     ///
     /// # Errors
     /// [`TeachError::NoPhotograph`], [`TeachError::Io`].
@@ -627,7 +627,7 @@ impl Teaching {
         self.set_left_out(number, false)
     }
 
-    /// Results that a change makes wrong are forgotten; what a person gave stays.
+    /// Discards the results that a change invalidates; data that a person gave stays.
     pub(crate) fn forget_from(&mut self, step: Step) {
         let state = &mut self.known.state;
         state.outdated = state.shape.take().or(state.outdated);
@@ -649,7 +649,7 @@ impl Teaching {
     }
 }
 
-/// From where results are forgotten.
+/// The step from which results are discarded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub(crate) enum Step {
     Poses,

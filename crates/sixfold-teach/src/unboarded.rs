@@ -1,5 +1,5 @@
-//! Camera and poses of photographs without a board: local features (XFeat, Potje et al. 2024) matched between all photographs, structure
-//! from motion, and metres from one known length or from measured depth.
+//! Camera and poses of photographs without a board: local features (XFeat, Potje et al. 2024) matched between all photographs,
+//! structure from motion, and the scale from one known length or from measured depth.
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -17,25 +17,26 @@ use crate::view::{bilinear_rgb, reduced};
 
 /// Longer side at which features are searched, pixels. Chosen by hand; not swept.
 const SIDE: usize = 1280;
-/// Most features of a photograph. With 4096 matching takes four times as long, and poses are no better: 0.57 mm in place of 0.51 mm on
-/// simulated photographs (`examples/poses_without_board.rs`).
+/// Maximum number of features of a photograph. With 4096, matching takes four times as long, and poses are no better: 0.57 mm in
+/// place of 0.51 mm on simulated photographs (`examples/poses_without_board.rs`).
 const FEATURES: usize = 2048;
-/// Rotations of a photograph in which its features are described once more, degrees: descriptors bear about 30 degrees, and from one side
-/// of an object to another the ground rotates in the image.
+/// Rotations of a photograph for which its features are described again, degrees: descriptors tolerate about 30 degrees, and
+/// between the sides of an object the ground rotates in the image.
 const ROTATIONS: [f64; 4] = [-90.0, -45.0, 45.0, 90.0];
 /// Smallest product of two descriptors that match, as in the authors' `match`.
 const LEAST_PRODUCT: f32 = 0.82;
-/// Focal length where nothing says so, as a fraction of the image's longer side: between a telephone (0.72) and a webcam (1.1).
+/// Focal length if unknown, as a fraction of the image's longer side: between a phone (0.72) and a webcam (1.1).
 const FOCAL_LENGTH: f64 = 0.9;
-/// A marked point may be this far from where the other photographs say, as a fraction of the image's longer side. Chosen by hand.
+/// Largest distance of a marked point from its position according to the other photographs, as a fraction of the image's longer
+/// side. Chosen by hand.
 const MARKED: f64 = 0.012;
 /// Smallest angle between two rays to a marked point, degrees. Chosen by hand.
 const MARKED_ANGLE: f64 = 5.0;
-/// What messages call the two marked points.
+/// The names of the two marked points in messages.
 const WHICH: [&str; 2] = ["first", "second"];
-/// Fewest depths that say a scale.
+/// Minimum number of depths for a scale.
 const FEWEST_DEPTHS: usize = 30;
-/// Depths around one that says a scale differ by less than this fraction: none at a border.
+/// Depths around a depth that is used for the scale differ by less than this fraction, which excludes borders.
 const SMOOTH: f32 = 0.03;
 
 /// Features of a photograph, in its pixels.
@@ -62,7 +63,7 @@ pub fn features_of(finder: &KeypointFinder, image: &RgbImage) -> Result<Features
     Ok(Features { points: positions.iter().map(|p| at(p.x, p.y)).collect(), descriptors, rotated })
 }
 
-/// An image rotated about its centre, grey where it shows nothing, and where points of it are then.
+/// An image rotated about its centre, grey outside the original, and the rotated positions of points.
 fn rotated(image: &RgbImage, angle: f64, points: &[Vec2]) -> (RgbImage, Vec<Vec2>) {
     let (w, h) = (image.width() as f64, image.height() as f64);
     let (sin, cos) = angle.sin_cos();
@@ -86,47 +87,48 @@ fn rotated(image: &RgbImage, angle: f64, points: &[Vec2]) -> (RgbImage, Vec<Vec2
     (rotated, points.iter().map(place).collect())
 }
 
-/// What a photograph shows.
+/// A photograph with its features.
 #[derive(Debug, Clone)]
 pub struct SeenFeatures {
-    /// What messages call the photograph.
+    /// The photograph's name in messages.
     pub name: String,
     /// Its width and height, pixels.
     pub size: (usize, usize),
     /// Its features.
     pub features: Features,
-    /// The focal length that its file names, pixels.
+    /// The focal length from its file, pixels.
     pub focal_length: Option<f64>,
 }
 
-/// A known length: that between two points which somebody marked.
+/// A known length between two points that a person marked.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct KnownLength {
     /// The length, metres.
     pub metres: f64,
-    /// Number of a photograph, and where it shows the two points, raw pixels; `None` where it does not show one.
+    /// Number of a photograph and the raw pixels of the two points in it; `None` for a point that it does not show.
     pub ends: Vec<(usize, [Option<[f64; 2]>; 2])>,
 }
 
-/// Photographs put together, in metres: z up; the origin is below the point at which the cameras look.
+/// Registered photographs, in metres: z up; the origin is below the point at which the cameras look.
 #[derive(Debug, Clone)]
 pub struct PutTogether {
     /// The camera of all photographs.
     pub camera: Camera,
     /// For each photograph the camera's pose, or why it has none.
     pub camera_from_world: Vec<Result<Pose, String>>,
-    /// Height of the plane on which the object stands, metres; `None` where points show none.
+    /// Height of the plane on which the object stands, metres; `None` if the points show no plane.
     pub floor: Option<f64>,
-    /// Root of the mean squared distance of features from where the points are, pixels.
+    /// Root mean square reprojection error of the features, pixels.
     pub rms: f64,
 }
 
 /// Measured depth of a photograph, metres, from the same pixels; `None` where there is none.
 pub type DepthOf<'a> = &'a dyn Fn(usize) -> Result<Option<DepthImage>, TeachError>;
 
-/// Finds the camera, if it is not known, and its pose in each photograph, from features. The length says how long a metre is, else
-/// measured depth. Progress counts pairs of photographs twice (matched, put together), then photographs.
+/// Finds the camera, if it is not known, and its pose in each photograph, from features. The scale comes from the length or,
+/// without one, from measured depth. Progress counts pairs of photographs twice (for matching and for reconstruction), then
+/// photographs.
 ///
 /// # Errors
 /// [`TeachError::NotTogether`], [`TeachError::Sfm`], [`TeachError::NoScale`], [`TeachError::Ends`], [`TeachError::CameraSize`],
@@ -147,7 +149,7 @@ pub fn put_together(
         let (camera_width, camera_height) = (camera.width, camera.height);
         return Err(TeachError::CameraSize { width, height, camera_width, camera_height });
     }
-    // Before anything takes time.
+    // Check this before the slow steps.
     match length {
         Some(length) => check_ends(seen, length)?,
         None => check_depth(seen.len(), depth)?,
@@ -185,7 +187,7 @@ fn other_size((w, h): (usize, usize), (width, height): (usize, usize)) -> String
     )
 }
 
-/// The photographs put together, in the unit of the reconstruction.
+/// The reconstruction of the photographs, in its own unit.
 fn scene_of(
     seen: &[SeenFeatures],
     size: (usize, usize),
@@ -203,7 +205,7 @@ fn scene_of(
         seen.iter().filter(|s| s.size == size).filter_map(|s| s.focal_length).collect();
     let focal_length = upper_median(&mut focal_lengths);
     let options = SfmOptions {
-        // Features are as exact as the pixels in which they were searched.
+        // Features are as accurate as the pixels of the image in which they were searched.
         threshold_px: SfmOptions::default().threshold_px * (longest / SIDE as f64).max(1.0),
         refine_camera: camera.is_none(),
         focal_length_from_camera: focal_length.is_some(),
@@ -217,7 +219,7 @@ fn scene_of(
     .map_err(|error| named(error, seen, size))
 }
 
-/// A camera of which the size is known, and perhaps the focal length (pixels).
+/// A guessed camera of known image size; the focal length (pixels) may be known too.
 fn guessed((width, height): (usize, usize), focal_length: Option<f64>) -> Camera {
     let f = focal_length.unwrap_or(FOCAL_LENGTH * width.max(height) as f64);
     let (cx, cy) = (0.5 * (width as f64 - 1.0), 0.5 * (height as f64 - 1.0));
@@ -277,7 +279,7 @@ fn check_depth(count: usize, depth: DepthOf<'_>) -> Result<(), TeachError> {
     Err(TeachError::NoScale)
 }
 
-/// How long the unit of the reconstruction is, from the length between two marked points.
+/// The unit of the reconstruction in metres, from the length between two marked points.
 fn metres_of_length(
     scene: &Reconstruction,
     seen: &[SeenFeatures],
@@ -347,7 +349,7 @@ fn marked(
     Ok(point)
 }
 
-/// How long the unit of the reconstruction is, from measured depth: the median ratio at all features whose point is known.
+/// The unit of the reconstruction in metres, from measured depth: the median ratio over all features with a known point.
 fn metres_of_depth(
     scene: &Reconstruction,
     seen: &[SeenFeatures],
@@ -375,7 +377,7 @@ fn metres_of_depth(
     }
 }
 
-/// The depth at a pixel, unless it or one beside it is not measured or at a border.
+/// The depth at a pixel; `None` if the pixel or one of its neighbours has no depth or is at a border.
 fn smooth_depth(depth: &DepthImage, pixel: &Vec2) -> Option<f32> {
     let (x, y) = (pixel.x.round() as isize, pixel.y.round() as isize);
     let centre = *depth.get(usize::try_from(x).ok()?, usize::try_from(y).ok()?)?;
@@ -401,7 +403,7 @@ mod tests {
         Camera { fx: 500.0, fy: 500.0, cx: 319.5, cy: 239.5, width: 640, height: 480, distortion: None }
     }
 
-    /// Sixty points of a patch half a metre away in a reconstruction whose unit is 0.5 m, and the same from two other sides.
+    /// Sixty points of a patch half a metre away in a reconstruction whose unit is 0.5 m, seen also from two other sides.
     fn scene() -> (Reconstruction, Vec<SeenFeatures>) {
         let poses: Vec<Pose> =
             (0..SIDES).map(|i| looking_at(&Vec3::zeros(), 20.0 * i as f64, 40.0, 1.0, 0.0)).collect();

@@ -4,30 +4,31 @@ use sixfold_geometry::nalgebra::{Rotation3, UnitQuaternion};
 use sixfold_geometry::stats::median;
 use sixfold_geometry::{Mat3, Plane, PlaneOptions, PointCloud, Pose, Vec3, dominant_plane, fit_plane};
 
-/// Points within this distance of a plane belong to it while it is searched, as a fraction of the cameras' distance. Chosen by hand.
+/// Points within this distance of a plane count as its inliers in the search, as a fraction of the cameras' distance.
+/// Chosen by hand.
 const THICKNESS: f64 = 0.008;
-/// Only points within this distance of where the cameras look count, as a fraction of the cameras' distance: what is beyond the
-/// table says nothing about it. Chosen by hand.
+/// Only points within this distance of the point at which the cameras look count, as a fraction of the cameras' distance: points
+/// beyond the table carry no information about it. Chosen by hand.
 const REACH: f64 = 0.8;
-/// Planes that are tried, the one with most points first: a side of a box may hold more points than the table.
+/// Number of planes that are tried, the one with most points first: a side of a box may have more points than the table.
 const TRIES: usize = 4;
-/// Nothing is below a table, but for wrong points: this fraction. Chosen by hand.
+/// Maximum fraction of points below a table; such points are wrong. Chosen by hand.
 const BELOW: f64 = 0.05;
-/// Smallest fraction of the points that a table holds. Chosen by hand.
+/// Minimum fraction of the points on a table. Chosen by hand.
 const ON_TABLE: f64 = 0.1;
-/// Passes of the fit to what lies within three standard deviations.
+/// Passes of the fit to the points within three standard deviations.
 const PASSES: usize = 5;
 
-/// A frame in the reconstruction, whose unit of length it has.
+/// An upright frame in the unit of length of the reconstruction.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Upright {
     /// Takes points of the reconstruction to the frame.
     pub world_from_scene: Pose,
-    /// Whether the plane `z = 0` is one that points show.
+    /// Whether the points contain the plane `z = 0`.
     pub on_table: bool,
 }
 
-/// The frame of points of a scene and the cameras that see it.
+/// The upright frame from the points and cameras of a scene.
 pub(crate) fn upright(points: &[Vec3], camera_from_scene: &[Pose]) -> Upright {
     let eyes: Vec<Vec3> = camera_from_scene.iter().map(|p| p.inverse().translation()).collect();
     let centre = meeting_point(camera_from_scene, &eyes).unwrap_or_else(|| middle(points));
@@ -58,7 +59,7 @@ fn middle(points: &[Vec3]) -> Vec3 {
     Vec3::new(of(0), of(1), of(2))
 }
 
-/// The point nearest to the optical axes: least squares, weighted again by the inverse of the distances.
+/// The point nearest to the optical axes: least squares, reweighted by the inverse of the distances.
 fn meeting_point(poses: &[Pose], eyes: &[Vec3]) -> Option<Vec3> {
     let axes: Vec<Vec3> = poses.iter().map(|p| p.inverse().transform_direction(&Vec3::z())).collect();
     let mut weights = vec![1.0; axes.len()];
@@ -84,7 +85,8 @@ fn meeting_point(poses: &[Pose], eyes: &[Vec3]) -> Option<Vec3> {
     (point.iter().all(|v| v.is_finite()) && 2 * before > axes.len()).then_some(point)
 }
 
-/// The plane with the most points that has all cameras on one side and nothing on the other, its normal on the cameras' side.
+/// The plane with the most points that has all cameras on one side and nothing on the other; its normal points to the cameras'
+/// side.
 fn table(points: &[Vec3], eyes: &[Vec3], thickness: f64) -> Option<Plane> {
     let middle = eyes.iter().sum::<Vec3>() / eyes.len().max(1) as f64;
     let options = PlaneOptions {
@@ -108,7 +110,7 @@ fn table(points: &[Vec3], eyes: &[Vec3], thickness: f64) -> Option<Plane> {
     None
 }
 
-/// The plane through what lies within three standard deviations of it.
+/// The plane fitted to the points within three standard deviations of it.
 fn fitted(plane: Plane, points: &[Vec3], above: &Vec3, thickness: f64) -> Plane {
     let mut plane = plane;
     for _ in 0..PASSES {

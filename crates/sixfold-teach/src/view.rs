@@ -1,25 +1,25 @@
-//! Photographs with known poses, and what each of them shows of a part of space.
+//! Photographs with known poses, and their views of a volume.
 
 use std::sync::Arc;
 
 use rayon::prelude::*;
 use sixfold_geometry::{Camera, DepthImage, Image, Mask, Pose, RgbImage, Vec2, Vec3};
 
-/// Most samples along a side of a pixel where a photograph is made smaller.
+/// Maximum number of samples along a side of a pixel when a photograph is made smaller.
 const MOST_SAMPLES: f64 = 4.0;
 
-/// A photograph of which camera and pose are known. The world is whatever its poses say: the board, or an object.
+/// A photograph with known camera and pose. The poses define the world frame: the board's, or an object's.
 #[derive(Debug, Clone)]
 pub struct PosedPhotograph {
-    /// What messages call it.
+    /// Its name in messages.
     pub name: String,
     /// The image, as stored.
     pub image: Arc<RgbImage>,
     /// Measured depth in metres, from the same pixels.
     pub depth: Option<Arc<DepthImage>>,
-    /// Where the object is or may be, if somebody said so, without lens distortion.
+    /// A given mask of the pixels where the object is or may be, without lens distortion.
     pub mask: Option<Arc<Mask>>,
-    /// The part of the mask where something may hide the object: it says nothing there.
+    /// The part of the mask where something may occlude the object; these pixels are ignored.
     pub hidden: Option<Arc<Mask>>,
     /// Its camera, with lens distortion.
     pub camera: Camera,
@@ -30,7 +30,7 @@ pub struct PosedPhotograph {
 /// A box with sides along the axes of the world, metres.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Volume {
-    /// Least coordinates.
+    /// Smallest coordinates.
     pub low: Vec3,
     /// Largest coordinates.
     pub high: Vec3,
@@ -47,27 +47,28 @@ impl Volume {
         (self.low + self.high) * 0.5
     }
 
-    /// The same centre with sides larger by a factor.
+    /// The box with the same centre and sides multiplied by a factor.
     #[must_use]
     pub fn scaled(&self, factor: f64) -> Volume {
         let half = self.size() * (0.5 * factor);
         Volume { low: self.centre() - half, high: self.centre() + half }
     }
 
-    /// Larger by a length on each side.
+    /// The box enlarged by a length on each side.
     #[must_use]
     pub fn grown(&self, margin: f64) -> Volume {
         let margin = Vec3::repeat(margin);
         Volume { low: self.low - margin, high: self.high + margin }
     }
 
-    /// The common part.
+    /// The intersection with another box.
     #[must_use]
     pub fn within(&self, other: &Volume) -> Volume {
         Volume { low: self.low.sup(&other.low), high: self.high.inf(&other.high) }
     }
 
-    /// The least and largest pixels that a pinhole camera sees of it; `None` where a part lies behind the camera.
+    /// The smallest and largest pixel coordinates of its projection in a pinhole camera; `None` if a part is
+    /// behind the camera.
     pub(crate) fn seen_by(&self, pinhole: &Camera, camera_from_world: &Pose) -> Option<[Vec2; 2]> {
         let (mut low, mut high) = (Vec2::repeat(f64::INFINITY), Vec2::repeat(f64::NEG_INFINITY));
         for corner in self.corners() {
@@ -86,7 +87,7 @@ impl Volume {
     }
 }
 
-/// A part of a photograph, without lens distortion, reduced to the size at which it is worked on.
+/// A part of a photograph, without lens distortion, reduced to the size used for processing.
 #[derive(Debug, Clone)]
 pub(crate) struct View {
     pub image: RgbImage,
@@ -96,14 +97,15 @@ pub(crate) struct View {
     pub eye: Vec3,
     /// Metres; 0 where nothing was measured.
     pub depth: Option<DepthImage>,
-    /// A mask that somebody gave: where the object is or may be.
+    /// A given mask of the pixels where the object is or may be.
     pub mask: Option<Mask>,
-    /// The part of it where something may hide the object.
+    /// The part of it where something may occlude the object.
     pub hidden: Option<Mask>,
 }
 
 impl View {
-    /// What a photograph shows of a volume, at most `side` pixels wide and high; `None` where it is not in sight.
+    /// The part of a photograph that shows a volume, at most `side` pixels wide and high; `None` if the volume is
+    /// not in the image.
     pub fn new(photograph: &PosedPhotograph, volume: &Volume, side: usize) -> Option<View> {
         let pinhole = photograph.camera.without_distortion();
         let [low, high] = volume.seen_by(&pinhole, &photograph.camera_from_world)?;
@@ -154,7 +156,7 @@ impl View {
         })
     }
 
-    /// Where a point of the world is seen, and how deep; `None` behind the camera or outside the view.
+    /// The pixel and the depth of a point of the world; `None` behind the camera or outside the view.
     pub fn project(&self, point: &Vec3) -> Option<(Vec2, f64)> {
         let p = self.camera_from_world.transform_point(point);
         let pixel = self.camera.project(&p)?;
@@ -162,12 +164,12 @@ impl View {
         (pixel.x >= 0.0 && pixel.y >= 0.0 && pixel.x <= w && pixel.y <= h).then_some((pixel, p.z))
     }
 
-    /// Whether something may hide the object at a pixel.
+    /// Whether something may occlude the object at a pixel.
     pub fn is_hidden(&self, pixel: (usize, usize)) -> bool {
         self.hidden.as_ref().is_some_and(|hidden| hidden[pixel])
     }
 
-    /// The point of the world that a pixel shows at a depth, metres.
+    /// The point of the world at a pixel and a depth, metres.
     pub fn unproject(&self, x: f64, y: f64, depth: f64) -> Vec3 {
         self.camera_from_world.inverse().transform_point(&self.camera.unproject(&Vec2::new(x, y), depth))
     }
@@ -198,11 +200,11 @@ pub(crate) fn reduced(
     };
     let rows: Vec<[u8; 3]> =
         (0..height).into_par_iter().flat_map_iter(|y| (0..width).map(move |x| pixel(x, y))).collect();
-    // As many as the size says.
+    // The number of pixels matches the size.
     Image::from_vec(width, height, rows).unwrap_or_else(|_| Image::filled(width, height, [0; 3]))
 }
 
-/// The colour between pixels; beyond the border that of the border.
+/// The bilinearly interpolated colour; outside the image, that of the border.
 pub(crate) fn bilinear_rgb(image: &RgbImage, x: f64, y: f64) -> [f64; 3] {
     let (x0, x1, fx) = neighbours(x, image.width());
     let (y0, y1, fy) = neighbours(y, image.height());
@@ -214,7 +216,7 @@ pub(crate) fn bilinear_rgb(image: &RgbImage, x: f64, y: f64) -> [f64; 3] {
     })
 }
 
-/// A number between pixels; beyond the border that of the border.
+/// The bilinearly interpolated value; outside the image, that of the border.
 pub(crate) fn bilinear(image: &Image<f32>, x: f64, y: f64) -> f32 {
     let (x0, x1, fx) = neighbours(x, image.width());
     let (y0, y1, fy) = neighbours(y, image.height());
@@ -252,7 +254,7 @@ mod tests {
         };
         let wide = Volume { low: Vec3::new(-2.0, -2.0, 0.0), high: Vec3::new(2.0, 2.0, 0.1) };
         let view = View::new(&photograph, &wide, 200).unwrap();
-        // The border lies at column 39.5 of the pinhole's pixels, 60 pixels left of the centre.
+        // The border is at column 39.5 of the pinhole's pixels, 60 pixels left of the centre.
         let border = (view.camera.cx - 60.0 * view.camera.fx / 200.0).round() as usize;
         let row = view.camera.height / 2;
         let mask = view.mask.as_ref().unwrap();

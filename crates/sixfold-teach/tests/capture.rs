@@ -1,4 +1,4 @@
-//! Objects taught from simulated photographs with exact truth, and photographs that cannot teach any.
+//! Objects taught from simulated photographs with exact ground truth, and photographs from which no object can be taught.
 
 use std::sync::{Arc, OnceLock};
 
@@ -22,7 +22,7 @@ fn cuboid(low: [f64; 3], high: [f64; 3]) -> Mesh {
     Mesh::new((0..8).map(corner).collect(), faces).unwrap()
 }
 
-/// A body with a step: a wide foot and a narrow head beside its middle; no rotation maps it onto itself.
+/// A body with a step: a wide foot and a narrow, off-centre head; no rotation maps it onto itself.
 fn body() -> Mesh {
     let parts = [
         cuboid([-0.045, -0.03, 0.0], [0.045, 0.03, 0.045]),
@@ -81,7 +81,7 @@ fn png(image: &RgbImage) -> Vec<u8> {
     bytes.into_inner()
 }
 
-/// The network that the program carries, with a count of its calls.
+/// The built-in network, with a count of its calls.
 struct Salient(SalientSegmenter, std::sync::atomic::AtomicUsize);
 
 impl Salient {
@@ -105,7 +105,7 @@ fn coarse() -> ShapeOptions {
     ShapeOptions { fine_side: 320, coarse_cells: 72, fine_cells: 90, faces: 6000, ..ShapeOptions::default() }
 }
 
-/// Mean distances in metres, both ways, of what is above the board by a few millimetres.
+/// Mean distances in metres, in both directions, of the parts more than a few millimetres above the board.
 fn distances(found: &Mesh, truth: &Mesh) -> [f64; 2] {
     let points = |mesh: &Mesh, seed: u64| mesh.sample_surface(20_000, seed).points;
     let (a, b) = (points(found, 1), points(truth, 2));
@@ -150,7 +150,8 @@ fn a_body_is_taught_stored_and_exported_and_a_second_run_does_nothing_again() {
     let origin = Pose::from_translation(Vec3::new(rows[0][3], rows[1][3], rows[2][3]));
     let there = body().transformed(&truth.board_from_object);
     let [found, missing] = distances(&mesh.transformed(&origin), &there);
-    // Ten silhouettes leave something in the corner between foot and head; the truth has faces inside, where the two touch.
+    // Ten silhouettes do not carve the corner between foot and head completely; the true mesh has inner faces where the two
+    // touch.
     assert!(found < 4e-3 && missing < 5.5e-3, "{found} {missing}");
     // The head is blue, the foot red.
     let (low, high) = mesh.bounding_box();
@@ -178,7 +179,7 @@ fn a_body_is_taught_stored_and_exported_and_a_second_run_does_nothing_again() {
     let expected = truth.camera_from_board[4].transform_point(&origin.translation());
     assert!((pose.translation() - expected).norm() < 2e-3);
     drop(teaching);
-    // Once more: everything is there.
+    // Run again: everything exists already.
     let calls = salient.calls();
     let again = teach(&dir.path().join("work"), &salient);
     assert_eq!(salient.calls(), calls);
@@ -207,7 +208,7 @@ fn corrections_are_kept_and_what_they_change_is_made_again() {
     assert!(matches!(teaching.set_mask(0, &small, None), Err(TeachError::MaskSize { .. })));
     assert!(matches!(teaching.set_mask(99, &small, None), Err(TeachError::NoPhotograph { index: 99, .. })));
     teaching.set_left_out(9, true).unwrap();
-    // With masks of all photographs nobody has to look for them.
+    // With given masks of all photographs, none are searched.
     let salient = Salient::new();
     teaching.find_masks(&salient, &coarse(), &()).unwrap();
     assert_eq!(salient.calls(), 0);
@@ -220,7 +221,7 @@ fn corrections_are_kept_and_what_they_change_is_made_again() {
     teaching.set_pose(0, &pose).unwrap();
     assert!(teaching.shape().is_none(), "the mesh is of the old pose");
     assert_eq!(teaching.mask(0).unwrap().as_ref(), Some(&truth.masks[0]));
-    // Another photograph: poses that were found are found again, the given one stays.
+    // With another photograph, the found poses are computed again and the given one stays.
     teaching.add_photograph("p1.png", &truth.files[2]).unwrap();
     assert_eq!(teaching.photographs()[0].pose_by, Some(By::Person));
     assert_eq!(teaching.photographs()[2].pose_by, None);
@@ -240,7 +241,7 @@ fn a_correction_begins_again_only_what_it_changes_and_readers_see_it_all_the_tim
     let red = |image: &RgbImage| image.as_slice().iter().filter(|c| **c == [255, 200, 0]).count();
     assert!(red(&snapshot.overlay(3, 320).unwrap()) > 50);
     assert_eq!(snapshot.image(3, 320).unwrap().0.size(), (320, 240));
-    // A mask changes the mesh alone; the old mesh stays to be shown.
+    // A mask changes only the mesh; the old mesh is kept for display.
     teaching.set_mask(3, &truth.masks[3], None).unwrap();
     let snapshot = Snapshot::read(dir.path()).unwrap();
     assert!(snapshot.shape().is_none() && snapshot.last_mesh().unwrap().is_some());
@@ -251,7 +252,7 @@ fn a_correction_begins_again_only_what_it_changes_and_readers_see_it_all_the_tim
     assert_eq!(salient.calls(), calls);
     teaching.reconstruct(&coarse(), &()).unwrap();
     assert!(Snapshot::read(dir.path()).unwrap().shape().is_some());
-    // One that reaches beyond the space of the object is seen by all photographs.
+    // A mask that extends beyond the object's volume affects all photographs.
     let everywhere = Image::filled(640, 480, true);
     teaching.set_mask(4, &everywhere, None).unwrap();
     assert!(teaching.photographs()[0].mask_by.is_none());
@@ -264,7 +265,7 @@ fn a_correction_begins_again_only_what_it_changes_and_readers_see_it_all_the_tim
     assert!(matches!(error, TeachError::TooFewPhotographs { found: 3, .. }), "{error}");
 }
 
-/// What a capture says of its photographs with poses that are known.
+/// The error of a capture with known poses.
 fn failure(photographs: Vec<PosedPhotograph>) -> TeachError {
     let capture = Capture::on_board(photographs, Board::new(Paper::A4));
     segment(&capture, &Salient::new(), &coarse(), &()).unwrap_err()
@@ -320,7 +321,7 @@ fn files_that_are_no_photographs_are_refused_before_anything_is_kept() {
     let error = teaching.add_photograph("../../etc/passwd.jpg", b"text").unwrap_err();
     assert!(error.to_string().contains("passwd.jpg"), "{error}");
     assert!(teaching.photographs().is_empty() && !dir.path().join("photographs").exists());
-    // A path in a name leads nowhere: files have numbers.
+    // A path in a name has no effect: files are numbered.
     teaching.add_photograph("../../p.png", &photographs().files[0]).unwrap();
     assert!(dir.path().join("photographs/000000.png").is_file());
     let depth = teaching.add_depth(0, &photographs().files[0], 1e-3).unwrap_err();
@@ -334,7 +335,7 @@ fn files_that_are_no_photographs_are_refused_before_anything_is_kept() {
 
 #[test]
 fn measured_depth_cuts_a_hollow_that_no_silhouette_shows() {
-    // A box without a lid, from outside and above; its inside is seen by depth alone.
+    // A box without a lid, from outside and above; only depth shows its inside.
     let (r, t, h) = (0.04, 0.008, 0.06);
     let tub = Mesh::merged(&[
         cuboid([-r, -r, 0.0], [r, r, t]),
@@ -370,7 +371,7 @@ fn measured_depth_cuts_a_hollow_that_no_silhouette_shows() {
     assert!(shape.with_depth > 0.95);
 }
 
-/// The body without colours, in another frame: as somebody's CAD file has it.
+/// The body without colours, in another frame, as in a CAD file.
 fn untextured(file_from_body: &Pose) -> Mesh {
     let body = body();
     Mesh::new(body.vertices().to_vec(), body.faces().to_vec()).unwrap().transformed(file_from_body)
@@ -416,7 +417,7 @@ fn a_mesh_that_is_there_already_is_laid_into_the_photographs_and_coloured_by_the
     }
     assert!(right[1] > 20 * right[0], "{right:?}");
 
-    // Another mesh begins the last step again; one of another size is refused, and so is another object.
+    // Another mesh repeats the last step; a mesh of another size is refused, and so is another object.
     let twice =
         Mesh::new(given.vertices().iter().map(|v| v * 2.0).collect(), given.faces().to_vec()).unwrap();
     teaching.set_mesh(Some(&twice)).unwrap();
@@ -429,7 +430,7 @@ fn a_mesh_that_is_there_already_is_laid_into_the_photographs_and_coloured_by_the
     assert!(matches!(error, TeachError::MeshDoesNotFit { .. }), "{error}");
 }
 
-/// The right half of each mask hidden by something in every second photograph.
+/// The right half of the mask is occluded in every second photograph.
 fn half_hidden() -> Vec<(Mask, Option<Mask>)> {
     let cut = |(i, mask): (usize, &Mask)| {
         let [x, _, width, _] = mask.bounding_box().unwrap();
@@ -447,7 +448,7 @@ fn poses_and_masks_that_are_given_need_no_board_and_what_is_hidden_cuts_nothing(
     let options =
         TeachOptions { camera: Some(options().camera), world: World::Given, ..TeachOptions::default() };
     let mut teaching = Teaching::open(dir.path(), &options).unwrap();
-    // In the object's own frame, which no board knows.
+    // In the object's own frame, without a board.
     let pose = |i: usize| {
         let (p, b) = (&truth.camera_from_board[i], &truth.board_from_object);
         Pose::new(p.rotation() * b.rotation(), p.transform_point(&b.translation()))
@@ -470,15 +471,15 @@ fn poses_and_masks_that_are_given_need_no_board_and_what_is_hidden_cuts_nothing(
     let (true_low, true_high) = body().bounding_box();
     for k in 0..3 {
         assert!(low[k] < true_low[k] + 1e-3 && high[k] > true_high[k] - 1e-3, "cut: {low} {high}");
-        // Nothing is seen from below, and no plane is known.
+        // There is no view from below, and the plane is unknown.
         let most = if k == 2 { 0.05 } else { 0.015 };
         assert!(low[k] > true_low[k] - most && high[k] < true_high[k] + 0.015, "{low} {high}");
     }
-    // Where something hides the object, its colours are not the object's, and its mask does not show it.
+    // Where the object is occluded, the occluder's colours are not used, and the mask does not include it.
     let mask = teaching.mask(1).unwrap().unwrap();
     let hidden = half_hidden()[1].1.clone().unwrap();
     assert!(mask.as_slice().iter().zip(hidden.as_slice()).all(|(m, h)| !(*m && *h)));
-    // The same again changes nothing, in another run too.
+    // Giving the same again changes nothing, in another run too.
     let revision = teaching.revision();
     give(&mut teaching);
     assert!(teaching.shape().is_some() && teaching.revision() >= revision);
@@ -486,7 +487,7 @@ fn poses_and_masks_that_are_given_need_no_board_and_what_is_hidden_cuts_nothing(
     let mut again = Teaching::open(dir.path(), &options).unwrap();
     give(&mut again);
     assert!(again.shape().is_some(), "a second run begins nothing again");
-    // The same masks without a word of what hides the object cut it in two.
+    // The same masks without the occluded parts cut the object in half.
     for (i, (mask, hidden)) in half_hidden().iter().enumerate() {
         let certain = Mask::from_fn(mask.width(), mask.height(), |x, y| {
             mask[(x, y)] && !hidden.as_ref().is_some_and(|h| h[(x, y)])
@@ -518,7 +519,7 @@ fn poses_that_are_missing_or_fit_nothing_are_named() {
     }
     let error = teaching.locate(&()).unwrap_err();
     assert!(error.to_string().contains("p0.png: no pose was given"), "{error}");
-    // All the same pose: what the masks show has no place in common.
+    // All poses are the same: the masks have no common volume.
     for i in 0..5 {
         teaching.set_pose(i, &truth.camera_from_board[0]).unwrap();
         teaching.set_mask(i, &truth.masks[i], None).unwrap();
@@ -559,7 +560,7 @@ fn a_file_of_posed_photographs_is_read_with_its_floor_and_wrong_ones_are_named()
     assert!((low.z - 0.01).abs() < 3e-3, "10 mm above the board is what the file says: {low}");
     assert!((high.z - 0.1).abs() < 0.02, "{high}");
     drop(teaching);
-    // The same file again begins nothing again.
+    // The same file again repeats no step.
     assert!(open().unwrap().shape().is_some());
     let mut wrong = entries.clone();
     wrong[1]["cam_R_m2c"][0] = 3.0.into();

@@ -1,4 +1,5 @@
-//! Photographs without a board: poses, scale and floor against the truth of a simulation, and what is said where they teach nothing.
+//! Photographs without a board: poses, scale and floor compared with a simulation's ground truth, and the errors for unusable
+//! photographs.
 
 use sixfold_geometry::{Camera, DepthImage, Pose, RgbImage, Vec3, stats::median};
 use sixfold_mesh::Mesh;
@@ -104,7 +105,7 @@ impl Taken {
 #[test]
 fn poses_scale_and_floor_are_found_without_the_camera_and_what_cannot_be_is_said() {
     let mut taken = taken();
-    // One of another camera is left out, and the others are put together.
+    // A photograph of another camera is left out, and the others are registered.
     taken.seen[4].size = (480, 640);
     let length = length(&taken.truth, [0, 3, 6]);
     let found = taken.put(Some(&length)).unwrap();
@@ -114,7 +115,7 @@ fn poses_scale_and_floor_are_found_without_the_camera_and_what_cannot_be_is_said
     let [shift, rotation] = taken.errors(&found);
     assert!(shift < 0.004 && rotation < 0.5, "{shift} m, {rotation} degrees");
     assert!((found.camera.fx / camera().fx - 1.0).abs() < 0.02, "{:?}", found.camera);
-    // The world stands on the cloth, z up, below the object.
+    // The world's origin is on the cloth below the object, z up.
     assert_eq!(found.floor, Some(0.0));
     for (pose, truth) in found.camera_from_world.iter().zip(&taken.truth) {
         let Ok(pose) = pose else { continue };
@@ -134,11 +135,11 @@ fn assert_refused(taken: Taken, length: &KnownLength) {
     let stopped =
         put_together(&taken.seen, None, Some(length), &without_depth, &|done: usize, _: usize| done < 5);
     assert!(matches!(stopped, Err(TeachError::Stopped)));
-    // From one place.
+    // All from one viewpoint.
     let one = Taken { seen: vec![taken.seen[0].clone(); 5], ..taken };
     let two = KnownLength { ends: vec![length.ends[0], (3, length.ends[1].1)], ..length.clone() };
     refused(&one, Some(&two), &["one place", "walk around"]);
-    // Nothing to recognise.
+    // No texture.
     let bare = SeenFeatures {
         name: "bare.jpg".to_owned(),
         size: (640, 480),
@@ -174,7 +175,7 @@ fn a_teaching_keeps_the_poses_and_forgets_them_for_another_length() {
     assert!((before - there).abs() < 0.01, "{before} {there}");
     assert!(teaching.floor().is_some_and(|floor| floor.normal == Vec3::z()) && teaching.board().is_none());
     drop(teaching);
-    // Nothing is searched again, so nothing can be stopped.
+    // Nothing is computed again, so nothing can be stopped.
     let mut teaching = Teaching::open(folder.path().join("t"), &teach).unwrap();
     teaching.set_length(Some(length.clone())).unwrap();
     teaching.locate(&stop_at(0)).unwrap();

@@ -1,4 +1,4 @@
-//! GraspTask 1: a mesh, a camera and a pose become a depth image and a colour image:
+//! Example 1: render a depth image and a colour image from a mesh, a camera and a pose:
 //! `cargo run -p sixfold --example 01_render -- FOLDER`.
 
 use std::path::PathBuf;

@@ -1,4 +1,4 @@
-//! GraspTask 2: the pose of a known object in a real depth image, without training:
+//! Example 2: the pose of a known object in a real depth image, without training:
 //! `cargo run --release -p sixfold --example 02_pose_from_depth`.
 
 use sixfold::bop::Models;
@@ -16,10 +16,10 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let camera = scene.camera(3)?;
     let depth = scene.depth(3)?.ok_or("the frame has no depth")?;
 
-    // Any method: only this line names one.
+    // Only this line depends on the method.
     let method: &dyn PoseEstimator = &PpfEstimator::default();
 
-    // The image is prepared once, whatever is searched in it: holes, normals, table plane, cloud.
+    // The image is prepared once for all objects: holes, normals, table plane, cloud.
     let prepared = PreparedDepth::new(&depth, &camera, &method.depth_options())?;
     let query = Query { depth: Some(&prepared), ..Query::new(&camera) };
     let run = ImageRun { estimator: method, query };

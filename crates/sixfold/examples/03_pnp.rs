@@ -1,4 +1,4 @@
-//! GraspTask 3: a pose from points of an object and their pixels, a quarter of them wrong:
+//! Example 3: a pose from points of an object and their pixels, a quarter of them wrong:
 //! `cargo run -p sixfold --example 03_pnp`.
 
 use sixfold::geometry::{PnpOptions, Vec2, pnp_ransac};
@@ -10,7 +10,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let truth =
         Pose::exp(&[0.0, 0.0, 0.0, 1.9, 0.3, 0.4].into()).with_translation(Vec3::new(0.05, -0.02, 0.7));
 
-    // Correspondences: 100 points of the surface and where they are seen, with half a pixel of noise.
+    // Correspondences: 100 points of the surface and their pixels, with half a pixel of noise.
     let points = mug(0.04, 0.10, 0.004, 0.03)?.sample_surface(100, 0).points;
     let mut pixels: Vec<Vec2> = vec![];
     for (k, point) in points.iter().enumerate() {

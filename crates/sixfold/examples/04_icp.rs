@@ -1,4 +1,4 @@
-//! GraspTask 4: a rough pose aligned with a noisy depth image by point-to-plane ICP:
+//! Example 4: a rough pose aligned with a noisy depth image by point-to-plane ICP:
 //! `cargo run -p sixfold --example 04_icp`.
 
 use sixfold::geometry::{DepthTarget, IcpOptions, NormalOptions, PointCloud, icp, normals_from_depth};
@@ -19,7 +19,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let normals = normals_from_depth(&depth, &camera, &NormalOptions::default());
     let target = DepthTarget { depth: &depth, normals: &normals, camera: &camera };
 
-    // The source is what the mesh shows at the rough pose, in the object's frame.
+    // The source is the visible surface of the mesh at the rough pose, in the object's frame.
     let start = truth * Pose::exp(&[0.006, -0.004, 0.005, 0.05, -0.04, 0.03].into());
     let rendered = render_depth(&mesh, &start, &camera);
     let source = PointCloud::from_depth(&rendered, None, &camera).transformed(&start.inverse());

@@ -1,6 +1,6 @@
-//! GraspTask 5: a method on all targets of a BOP dataset, its result file, and the scores:
+//! Example 5: a method on all targets of a BOP dataset, its result file, and the scores:
 //! `cargo run --release -p sixfold --example 05_dataset_and_scores -- [DATASET [RESULTS.csv]]`.
-//! A run that was stopped resumes where it was.
+//! A stopped run can be resumed.
 
 use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;

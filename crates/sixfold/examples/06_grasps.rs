@@ -1,4 +1,4 @@
-//! GraspTask 6: grasps from one depth image of a mug on a table, and what becomes of the best one in a physics engine:
+//! Example 6: grasps from one depth image of a mug on a table, and a trial of the best one in a physics engine:
 //! `cargo run --release -p sixfold --example 06_grasps`.
 
 use sixfold::grasp::{
@@ -16,7 +16,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let eye = ViewPoint { azimuth: 0.3, elevation: 0.9, distance: 0.7, target: Vec3::new(0.0, 0.0, 0.04) };
     let seen = simulate_view(&mesh, &world_from_object, &eye, Some(&DepthSensor::realsense()), 0)?;
 
-    // From here on only the depth image is known.
+    // From here on only the depth image is used.
     let options = ViewOptions::default();
     let masks = find_objects(&seen.depth, &seen.camera, &options)?;
     let mask = masks.first().ok_or("nothing stands on the table")?;

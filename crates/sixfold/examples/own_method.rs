@@ -12,7 +12,7 @@ use sixfold::runner::{DatasetRun, RegionSource, RunOptions};
 
 const METHOD: &str = "median";
 
-/// What is derived from an object once.
+/// The data derived once from an object.
 struct Centre {
     name: String,
     centre: Vec3,

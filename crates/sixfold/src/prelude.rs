@@ -1,4 +1,4 @@
-//! The twenty types that a user needs first: `use sixfold::prelude::*;`.
+//! The twenty most needed types: `use sixfold::prelude::*;`.
 
 pub use sixfold_align::PreparedDepth;
 pub use sixfold_bop::{BopDataset, Estimate, EvalOptions};

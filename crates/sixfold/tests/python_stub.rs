@@ -1,4 +1,4 @@
-//! The defaults of trainings stand once, in the recipes: Python's stub shows those.
+//! The defaults of trainings are defined once, in the recipes; this checks that Python's stub shows them.
 
 #![cfg(feature = "experience")]
 
@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 
 use sixfold::nn::choice::Choice;
 
-/// The defaults that Python's stub shows for a training, as they stand there.
+/// The defaults that Python's stub shows for a training, as text.
 fn stub(function: &str) -> BTreeMap<String, String> {
     let file = concat!(env!("CARGO_MANIFEST_DIR"), "/../../python/package/sixfold/__init__.pyi");
     let text = std::fs::read_to_string(file).unwrap();
@@ -34,7 +34,7 @@ fn name(name: &str) -> String {
     format!("{name:?}")
 }
 
-/// Holds the defaults in the stub of a Python function against those of the recipe.
+/// Compares the defaults in the stub of a Python function with those of the recipe.
 fn check(function: &str, expected: Vec<(&str, String)>) {
     let expected = expected.into_iter().map(|(name, default)| (name.to_owned(), default)).collect();
     assert_eq!(stub(function), expected, "{function}");
@@ -42,7 +42,7 @@ fn check(function: &str, expected: Vec<(&str, String)>) {
 
 #[test]
 fn the_stub_of_python_shows_the_defaults_of_what_learns_from_images() {
-    // Not of the recipe: which of a dataset's frames are read.
+    // Not part of the recipe: which of a dataset's frames are read.
     let renders_only = || ("renders_only", word(false));
     let d = sixfold::pix2pose::recipe::Pix2PoseRecipe::default();
     check(

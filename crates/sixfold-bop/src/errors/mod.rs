@@ -1,7 +1,7 @@
-//! The pose errors, one idea a file. Metres, pixels and radians; symmetries as lists of poses that map the object
+//! The pose errors, one per file. Metres, pixels and radians; symmetries as lists of poses that map the object
 //! onto itself, the identity among them.
 //!
-//! Poses come as [`Placement`]s: a [`sixfold_geometry::Pose`] becomes one by itself.
+//! Poses are passed as [`Placement`]s; a [`sixfold_geometry::Pose`] is converted implicitly.
 
 mod placement;
 mod projection;

@@ -2,11 +2,11 @@
 
 use sixfold_geometry::{Mat3, Pose, Vec3};
 
-/// Where an object is: `rotation * point + translation`, metres.
+/// The placement of an object: `rotation * point + translation`, metres.
 ///
-/// The official evaluation takes the nine numbers of a result file as they are, also where rounding or a network's
-/// arithmetic left them a thousandth away from a rotation. Half a millimetre of error hangs on it, so the errors here
-/// take the numbers as they are, too.
+/// The official evaluation uses the nine numbers of a result file unchanged, even where rounding or a network's
+/// arithmetic left them a thousandth away from a rotation. This changes an error by up to half a millimetre, so the
+/// errors here use the numbers unchanged too.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Placement {
     /// The rotation, or nearly one.
@@ -34,7 +34,7 @@ impl From<&Placement> for Placement {
 }
 
 impl Placement {
-    /// This placement after a symmetry of the object.
+    /// The symmetry of the object first, then this placement.
     pub(crate) fn after(&self, symmetry: &Placement) -> Placement {
         Placement {
             rotation: self.rotation * symmetry.rotation,

@@ -26,7 +26,7 @@ pub fn mssd(
     best.sqrt()
 }
 
-/// Average Distance of model points in metres, corresponding points (Hinterstoisser et al. 2012).
+/// Average Distance between corresponding model points in metres (Hinterstoisser et al. 2012).
 pub fn add(points: &ModelPoints, estimate: impl Into<Placement>, ground_truth: impl Into<Placement>) -> f64 {
     let (estimate, ground_truth) = (estimate.into(), ground_truth.into());
     let a = estimate.rotation - ground_truth.rotation;
@@ -49,7 +49,8 @@ pub fn adi(points: &ModelPoints, estimate: impl Into<Placement>, ground_truth: i
     let (estimate, ground_truth) = (estimate.into(), ground_truth.into());
     let back = estimate.rotation.transpose();
     if (back * estimate.rotation - Mat3::identity()).amax() > 1e-6 {
-        // Not quite a rotation: distances change under it, so the points have to be where it puts them.
+        // The matrix is not exactly a rotation and changes distances, so the points have to be transformed by
+        // it.
         let placed: Vec<Vec3> = (0..points.len()).map(|i| estimate.rotation * points.point(i)).collect();
         if let Some(placed) = ModelPoints::new(&placed) {
             let translation = ground_truth.translation - estimate.translation;
@@ -100,7 +101,8 @@ mod tests {
 
     #[test]
     fn the_mean_and_the_largest_differ_where_they_should() {
-        // The estimate is 30 mm off in x and rotated by a half: ends move by 0.2 - 0.03 and 0.2 + 0.03.
+        // The estimate is shifted by 30 mm in x and rotated by half a turn: ends move by 0.2 - 0.03 and 0.2 +
+        // 0.03.
         let points = dumbbell();
         let g = rotated_about_z(0.0);
         let e = rotated_about_z(std::f64::consts::PI).with_translation(Vec3::new(0.03, 0.0, 1.0));
@@ -111,7 +113,8 @@ mod tests {
 
     #[test]
     fn numbers_that_are_not_quite_a_rotation_are_taken_as_they_are() {
-        // A rotation a thousandth too large moves the end at 0.1 m by 0.1 mm; symmetric or not, all say so.
+        // A rotation a thousandth too large moves the end at 0.1 m by 0.1 mm; all errors report that, with
+        // symmetries or without.
         let points = dumbbell();
         let g = Placement::from(rotated_about_z(0.0));
         let e = Placement { rotation: g.rotation * 1.001, ..g };

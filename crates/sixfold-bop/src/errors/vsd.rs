@@ -5,14 +5,14 @@
 use sixfold_geometry::{Camera, DepthImage};
 use thiserror::Error;
 
-/// How VSD is computed. The default is BOP's.
+/// Options of VSD. The default is BOP's.
 #[derive(Debug, Clone, PartialEq)]
 pub struct VsdOptions {
     /// Tolerance of the visibility test in metres: 15 mm in all BOP datasets but ITODD (5 mm).
     pub delta: f64,
     /// Misalignment tolerances.
     pub taus: Taus,
-    /// Whether a model is visible where the test image has no depth: so since 2019 ("bop19"), not in 2018 ("bop18").
+    /// Whether a model counts as visible where the test image has no depth: yes since 2019 ("bop19"), no in 2018 ("bop18").
     pub missing_is_visible: bool,
 }
 
@@ -26,7 +26,7 @@ pub enum Taus {
 }
 
 impl Taus {
-    /// The numbers, in their unit.
+    /// The tolerances, in the unit of the variant.
     pub fn values(&self) -> &[f64] {
         let (Taus::Diameters(values) | Taus::Metres(values)) = self;
         values
@@ -48,7 +48,7 @@ impl Default for VsdOptions {
 }
 
 impl VsdOptions {
-    /// Those of the benchmark of 2018 and of the dissertation: a tolerance of 20 mm, nothing visible where depth is missing.
+    /// The options of the benchmark of 2018 and of the dissertation: a tolerance of 20 mm, nothing visible where depth is missing.
     pub fn published() -> Self {
         VsdOptions {
             taus: Taus::Metres(vec![PUBLISHED_TAU]),
@@ -79,7 +79,7 @@ pub enum VsdError {
     /// The diameter is not a positive number.
     #[error("the diameter is {found} m, expected a number above zero")]
     Diameter {
-        /// What was given.
+        /// The given value.
         found: f64,
     },
 }
@@ -91,9 +91,8 @@ fn is_depth(z: f32) -> bool {
 /// The discrepancy in `0..=1` for every tau.
 ///
 /// `estimate` and `ground_truth` are depth images of the model rendered at the two poses (zero where the model is
-/// not), `test` is what the sensor saw (zero where nothing was measured). All three in metres, of the camera's size.
-/// Distances are along the ray, not along the optical axis. Where nothing of either model is visible the discrepancy
-/// is one.
+/// not), `test` is the sensor's depth image (zero where nothing was measured). All three in metres, of the camera's size. Distances
+/// are along the ray, not along the optical axis. Where nothing of either model is visible the discrepancy is one.
 ///
 /// # Errors
 /// [`VsdError`] when an image has another size or the diameter is not positive.
@@ -251,8 +250,8 @@ mod tests {
         for diameter in [0.05, 0.5] {
             assert_eq!(published(e, g, g, diameter), vec![0.25]);
         }
-        // Of four pixels of the ground truth one has no depth: three count. The estimate misses one of them, and has one more where
-        // depth is missing, which counts for nothing: 1 of 3. Since 2019 both count: 2 of 5.
+        // One of the four pixels of the ground truth has no depth, so three count. The estimate misses one of them, and has one
+        // more where depth is missing, which counts for nothing: 1 of 3. Since 2019 both count: 2 of 5.
         let t = [OUT, OUT, 1.0, 1.0, 1.0, OUT, 2.0, 2.0, 2.0, 2.0];
         let e = [OUT, 1.0, 1.0, 1.0, OUT, 1.0, OUT, OUT, OUT, OUT];
         assert_eq!(published(e, g, t, 0.1), vec![1.0 / 3.0]);

@@ -1,4 +1,5 @@
-//! BOP'24: every instance of every object is to be found, and false detections cost (AP of MSSD and MSPD).
+//! BOP'24: every instance of every object is a target, and false detections lower the score (AP of MSSD and
+//! MSPD).
 
 use std::collections::BTreeMap;
 
@@ -14,8 +15,8 @@ use crate::results::Estimate;
 use crate::scene_files::Target;
 use crate::score::{average_precision, by_falling_score, fractions_05_to_50, greedy_matches, pixels_5_to_50};
 
-/// Scores estimates as 6D detections (BOP Challenge 2024): per image the 100 surest estimates count; ground truth
-/// below 10 % visibility (unknown counts as visible) is neither missed nor found.
+/// Scores estimates as 6D detections (BOP Challenge 2024): per image the 100 most confident estimates count;
+/// ground truth below 10 % visibility (unknown counts as visible) is ignored.
 ///
 /// # Errors
 /// As [`evaluate`](super::evaluate).

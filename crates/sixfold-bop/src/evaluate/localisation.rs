@@ -1,4 +1,4 @@
-//! BOP'19: the poses that are to be found, by VSD, MSSD and MSPD (Hodaň et al. 2020) and ADD(-S) (Hinterstoisser et al. 2012).
+//! BOP'19: recall of the target poses, by VSD, MSSD and MSPD (Hodaň et al. 2020) and ADD(-S) (Hinterstoisser et al. 2012).
 
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -64,7 +64,7 @@ fn why_no_vsd(prepared: &Prepared<'_>, options: &EvalOptions) -> Option<String> 
     }
 }
 
-/// The errors of all tasks of an image; those of VSD where it is given its options and the image has depth.
+/// The errors of all tasks of an image; VSD errors only if options for VSD are given and the image has depth.
 fn errors_of_image<'p, 'a>(
     prepared: &'p Prepared<'a>,
     image: &'p ImageTasks<'a>,
@@ -121,7 +121,7 @@ fn recall_of_vsd(scored: &[Scored<'_, '_>], options: &EvalOptions) -> (AverageRe
         .flat_map(|tau| options.vsd_thresholds.iter().map(move |&t| (tau, t)))
         .map(|(a, b)| by_tau(a, b))
         .collect();
-    // Found and wanted summed over the taus: the mean recall.
+    // Poses found and targets are summed over the taus, which gives the mean recall.
     let steps = options.curve_steps;
     let list: Vec<(f64, Counts)> = (0..=steps)
         .map(|i| {
@@ -175,7 +175,7 @@ impl Recalls {
         }
     }
 
-    /// The scores of an object with so many targets.
+    /// The scores of an object with this number of targets.
     fn of_object(&self, id: u32, targets: usize) -> ObjectScores {
         let of = |recall: &AverageRecall| recall.1.get(&id).copied();
         ObjectScores {
@@ -199,7 +199,7 @@ impl Recalls {
 struct Reasons(BTreeMap<String, String>);
 
 impl Reasons {
-    /// Of objects without recall of ADD(-S).
+    /// The reasons for objects without recall of ADD(-S).
     fn of_objects(prepared: &Prepared<'_>, objects: &BTreeMap<u32, ObjectScores>) -> Reasons {
         let mut reasons = Reasons::default();
         for (id, _) in objects.iter().filter(|(_, scores)| scores.add_s_recall.is_none()) {
@@ -210,7 +210,7 @@ impl Reasons {
         reasons
     }
 
-    /// Of the scores of all targets.
+    /// Adds the reasons for missing scores over all targets.
     fn add_overall(&mut self, nothing: Option<&String>, no_vsd: Option<&String>, other_protocol: bool) {
         if let Some(reason) = nothing {
             for score in ["ar", "ar_vsd", "ar_mssd", "ar_mspd", "add_s_recall"] {
@@ -226,7 +226,7 @@ impl Reasons {
         }
     }
 
-    /// A score; its reason where there is none.
+    /// The score; if there is none, its reason is kept under `name`.
     fn score(&mut self, name: &str, score: Result<f64, String>) -> Option<f64> {
         score.map_err(|reason| self.0.insert(name.to_owned(), reason)).ok()
     }
@@ -234,12 +234,12 @@ impl Reasons {
 
 /// Scores estimates on a dataset.
 ///
-/// `targets` as from [`BopDataset::targets`]; those of whole images are spelled out from the ground truth. `progress`
-/// receives every image. The result is the same at any number of threads.
+/// `targets` as from [`BopDataset::targets`]; targets of whole images are expanded to objects from the ground truth.
+/// `progress` is called for every image. The result is the same for any number of threads.
 ///
 /// # Errors
-/// [`EvalError`] when an option is out of range or a file of the dataset is broken. What is merely not there (depth,
-/// a model) leaves scores empty, with reasons. [`EvalError::Stopped`] where `progress` says so.
+/// [`EvalError`] when an option is out of range or a file of the dataset is broken. Missing data (depth, a model) leaves
+/// scores empty, with reasons. [`EvalError::Stopped`] when `progress` asks to stop.
 pub fn evaluate(
     dataset: &BopDataset,
     estimates: &[Estimate],

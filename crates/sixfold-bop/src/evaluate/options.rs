@@ -1,4 +1,4 @@
-//! How results are scored: tolerances, thresholds, which poses count; and why that can fail.
+//! Options of an evaluation (tolerances, thresholds, which poses count), and its errors.
 
 use std::path::Path;
 
@@ -9,7 +9,7 @@ use crate::dataset_error::DatasetError;
 use crate::errors::{Taus, VsdError, VsdOptions};
 use crate::score::fractions_05_to_50;
 
-/// How an evaluation is done. The default is the BOP Challenge's.
+/// Options of an evaluation. The default is the BOP Challenge's.
 #[derive(Debug, Clone, PartialEq)]
 pub struct EvalOptions {
     /// Step of discretised continuous symmetries, as a fraction of the diameter.
@@ -18,14 +18,14 @@ pub struct EvalOptions {
     pub vsd: VsdOptions,
     /// A pose is right by VSD if its error is below a threshold; recall is the mean over these.
     pub vsd_thresholds: Vec<f64>,
-    /// Compute VSD at all: it renders every estimate and every target.
+    /// Whether VSD is computed, which renders every estimate and every target.
     pub compute_vsd: bool,
     /// Which poses are targets: `None` takes the `inst_count` most visible ones (BOP'19), a number takes those with
     /// at least that visible fraction.
     pub visib_gt_min: Option<f64>,
     /// Steps of the recall curves.
     pub curve_steps: usize,
-    /// Which model folder.
+    /// The model folder to use.
     pub models: Models,
 }
 
@@ -52,9 +52,9 @@ pub enum EvalError {
     Option {
         /// Name of the option.
         field: &'static str,
-        /// What it held.
+        /// Its value.
         found: f64,
-        /// What it should hold.
+        /// The expected value.
         expected: &'static str,
     },
     /// The dataset is broken.
@@ -63,19 +63,19 @@ pub enum EvalError {
     /// A depth image does not fit (cannot happen with images that passed the size check).
     #[error(transparent)]
     Vsd(#[from] VsdError),
-    /// Whoever received the progress asked to stop.
+    /// The receiver of the progress reports asked to stop.
     #[error("the evaluation was stopped")]
     Stopped,
 }
 
-/// The delta of ITODD in the BOP Challenge, metres; of all others it is the default.
+/// The delta of ITODD in the BOP Challenge, metres; all other datasets use the default.
 const ITODD: (&str, f64) = ("itodd", 0.005);
-/// Threshold of VSD and least visible fraction of a pose that is to be found, in the benchmark of 2018 (Hodan, Michel et al. 2018,
-/// section 4.2) and in table 3.6 of the dissertation.
+/// Threshold of VSD and minimum visible fraction of a target pose, in the benchmark of 2018 (Hodan, Michel et al. 2018, section
+/// 4.2) and in table 3.6 of the dissertation.
 const PUBLISHED: (f64, f64) = (0.3, 0.1);
 
 impl EvalOptions {
-    /// Those of the BOP Challenge for the dataset in a folder, which is known by its name.
+    /// The options of the BOP Challenge for the dataset in a folder, which is recognised by the folder's name.
     pub fn for_dataset(folder: &Path) -> EvalOptions {
         let mut options = EvalOptions::default();
         if folder.file_name().is_some_and(|name| name.eq_ignore_ascii_case(ITODD.0)) {
@@ -84,8 +84,8 @@ impl EvalOptions {
         options
     }
 
-    /// Those of the benchmark of 2018, by which the dissertation scores T-LESS (section 3.4.4): VSD below 0.3 with a tolerance of
-    /// 20 mm, of every pose that is at least 10 % visible.
+    /// The options of the benchmark of 2018, by which the dissertation scores T-LESS (section 3.4.4): VSD below 0.3 with a
+    /// tolerance of 20 mm; targets are all poses that are at least 10 % visible.
     pub fn published() -> EvalOptions {
         let (threshold, visible) = PUBLISHED;
         EvalOptions {
@@ -96,7 +96,7 @@ impl EvalOptions {
         }
     }
 
-    /// How VSD is averaged, in words; `None` as in the BOP Challenge, where it counts for AR.
+    /// How VSD is averaged, in words; `None` for the protocol of the BOP Challenge, where VSD counts for AR.
     pub(super) fn vsd_protocol(&self) -> Option<String> {
         let usual = EvalOptions::default();
         let same = self.vsd.taus == usual.vsd.taus

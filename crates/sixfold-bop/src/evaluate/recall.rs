@@ -1,4 +1,4 @@
-//! Recall: how many of the poses that are to be found are found, at a threshold and averaged over several.
+//! Recall: the fraction of target poses that are found, at one threshold and averaged over several.
 
 use std::collections::BTreeMap;
 
@@ -7,7 +7,7 @@ use super::task_errors::TaskErrors;
 use super::tasks::Task;
 use crate::score::greedy_matches;
 
-/// Recall at a threshold: found and wanted per object.
+/// Recall at a threshold: the numbers of found poses and of targets per object.
 pub(super) struct Counts(pub BTreeMap<u32, (usize, usize)>);
 
 impl Counts {

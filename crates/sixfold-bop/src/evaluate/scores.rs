@@ -1,4 +1,4 @@
-//! What an evaluation yields.
+//! The result of an evaluation.
 
 use std::collections::BTreeMap;
 
@@ -45,14 +45,15 @@ pub struct ObjectScores {
     pub add_s_recall: Option<f64>,
 }
 
-/// The scores of a result file. A score that cannot be computed is `None` and `reasons` has why, under its name.
+/// The scores of a result file. A score that cannot be computed is `None`, and `reasons` states why under the score's
+/// name.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Evaluation {
     /// Mean of the three average recalls.
     pub ar: Option<f64>,
-    /// Average recall of VSD, over taus and thresholds; of one each, the recall.
+    /// Average recall of VSD over taus and thresholds; with one of each, the recall.
     pub ar_vsd: Option<f64>,
-    /// How VSD counts, where it is not as in the BOP Challenge.
+    /// How VSD is averaged, where it differs from the BOP Challenge.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub vsd_protocol: Option<String>,
     /// Average recall of MSSD, over thresholds .05 to .5 diameters.
@@ -64,7 +65,7 @@ pub struct Evaluation {
     pub add_s_recall: BTreeMap<String, Option<f64>>,
     /// Area under the accuracy-threshold curve of ADD to 10 cm, over all targets (PoseCNN, Xiang et al. 2018).
     pub add_auc: Option<f64>,
-    /// The same of ADD-S, taken for every object, symmetric or not.
+    /// The same for ADD-S, computed for every object, symmetric or not.
     pub add_s_auc: Option<f64>,
     /// Why a score is missing.
     pub reasons: BTreeMap<String, String>,
@@ -72,7 +73,7 @@ pub struct Evaluation {
     pub targets: usize,
     /// Estimates that were compared with ground truth.
     pub estimates: usize,
-    /// Estimates of images or objects that are no targets, or beyond the number of instances asked for.
+    /// Estimates of images or objects that are not targets, or beyond the number of instances requested.
     pub estimates_left_out: usize,
     /// Mean seconds per image.
     pub average_time_per_image: Option<f64>,
@@ -82,10 +83,10 @@ pub struct Evaluation {
     pub curves: Curves,
 }
 
-/// Scores of 6D detection (BOP'24): every instance of every object is to be found, false detections cost.
+/// Scores of 6D detection (BOP'24): every instance of every object is a target, and false detections lower the score.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct DetectionEvaluation {
-    /// Mean of the two.
+    /// Mean of `ap_mssd` and `ap_mspd`.
     pub ap: Option<f64>,
     /// Average precision over MSSD thresholds .05 to .5 diameters, mean over objects.
     pub ap_mssd: Option<f64>,

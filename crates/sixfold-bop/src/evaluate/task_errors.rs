@@ -8,7 +8,8 @@ use crate::errors::{Placement, VsdError, VsdOptions, add, adi, mspd, mssd, vsd};
 use crate::results::Estimate;
 use crate::scene_files::GroundTruth;
 
-/// All errors of a task, `[estimate][ground truth]`; MSSD and ADD in diameters, MSPD scaled to a width of 640.
+/// All errors of a task, `[estimate][ground truth]`; MSSD and ADD in diameters, MSPD in pixels scaled to an image
+/// width of 640.
 #[derive(Default)]
 pub(super) struct TaskErrors {
     pub mssd: Vec<Vec<f64>>,
@@ -36,7 +37,7 @@ pub(super) fn surface_and_projection(
         let row = |e: &&Estimate| truth.iter().map(|g| error(&e.placement(), g)).collect();
         task.estimates.iter().map(row).collect()
     };
-    // Further apart than a diameter is wrong at every threshold; the reference does not look closer either.
+    // Poses further apart than a diameter are wrong at every threshold; the reference implementation skips them too.
     let apart = |e: &Placement, g: &Placement| e.distance_to(g) >= object.diameter;
     let d = object.diameter;
     TaskErrors {
@@ -58,13 +59,13 @@ pub(super) fn surface_and_projection(
     }
 }
 
-/// For every pose that is to be found, the smallest ADD and the smallest ADI of the task's estimates, metres; infinite
-/// where there is none.
+/// For every target pose, the smallest ADD and the smallest ADI of the task's estimates, metres; infinite if the task
+/// has no estimates.
 fn nearest_errors(task: &Task<'_>, object: &Object) -> Vec<[f64; 2]> {
     let of = |g: &GroundTruth| {
         task.estimates.iter().fold([f64::INFINITY; 2], |[a, s], e| {
             let (e, g) = (e.placement(), g.placement());
-            // Neither can be smaller than what separates the centres of two equal point sets by more than both radii.
+            // Both errors are at least the distance of the centres of the two equal point sets minus both radii.
             if e.distance_to(&g) >= object.diameter + LARGEST_AUC_ERROR {
                 return [a, s];
             }

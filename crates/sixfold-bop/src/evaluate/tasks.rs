@@ -1,4 +1,4 @@
-//! What is compared in each image: the poses to be found of each object, and the best estimates for them.
+//! The comparisons of each image: the target poses of each object, and the best estimates for them.
 
 use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet};
@@ -15,7 +15,7 @@ use crate::results::Estimate;
 use crate::scene_files::{GroundTruth, Target, TargetObject};
 use crate::score::by_falling_score;
 
-/// An object as the errors need it.
+/// An object's data for the errors.
 pub(super) struct Object {
     pub points: ModelPoints,
     pub mesh: Mesh,
@@ -62,7 +62,7 @@ impl Prepared<'_> {
         self.wanted_of_objects().values().sum()
     }
 
-    /// The same of each object.
+    /// Number of target poses of each object.
     pub(super) fn wanted_of_objects(&self) -> BTreeMap<u32, usize> {
         let mut wanted = BTreeMap::new();
         for task in self.images.iter().flat_map(|i| &i.tasks) {
@@ -148,7 +148,7 @@ fn poses_of(image: &SceneImage, obj_id: u32) -> (Vec<GroundTruth>, Vec<f64>) {
     of.map(|(g, v)| (*g, v.unwrap_or(1.0))).unzip()
 }
 
-/// Every object that is to be found, with as many estimates as instances are asked for.
+/// Every target object, with as many estimates as instances are requested.
 fn localisation_tasks<'a>(
     image: &SceneImage,
     objects: &BTreeMap<u32, usize>,
@@ -169,8 +169,8 @@ fn localisation_tasks<'a>(
     objects.iter().map(task).collect()
 }
 
-/// Every object with ground truth in the image; estimates of others are false, but the reference never computes their errors and
-/// so never counts them. Here likewise.
+/// Every object with ground truth in the image. Estimates of other objects are false, but the reference implementation does not
+/// compute their errors and so does not count them; neither does this one.
 fn detection_tasks<'a>(image: &SceneImage, found: &ByObject<'a>) -> Vec<Task<'a>> {
     let ids: BTreeSet<u32> = image.ground_truth.iter().map(|g| g.obj_id).collect();
     let mut best = best_of_image(found, 100);
@@ -206,7 +206,7 @@ fn load_objects(
             Err(error) => return Err(error.into()),
         };
         if let Some((file, infos)) = info {
-            // A symmetry that the object does not have makes wrong poses right.
+            // A symmetry that the object does not have would make wrong poses count as right.
             infos.check_symmetries(obj_id, &mesh, file).map_err(|e| DatasetError::Model(Box::new(e)))?;
         }
         let known: Option<&ModelInfo> = info.as_ref().and_then(|(_, i)| i.0.get(&obj_id));
@@ -222,7 +222,7 @@ fn load_objects(
     Ok((objects, unusable))
 }
 
-/// Marks the `count` most visible poses; equally visible ones in their order.
+/// Marks the `count` most visible poses; ties are broken by their order.
 fn most_visible(visible: &[f64], count: usize) -> Vec<bool> {
     let mut order: Vec<usize> = (0..visible.len()).collect();
     by_falling_score(&mut order, |&i| visible[i]);
@@ -233,7 +233,7 @@ fn most_visible(visible: &[f64], count: usize) -> Vec<bool> {
     valid
 }
 
-/// The `most` surest estimates of an image, by object, each list by falling score.
+/// The `most` most confident estimates of an image, by object, each list by falling score.
 fn best_of_image<'a>(objects: &ByObject<'a>, most: usize) -> ByObject<'a> {
     let mut all: Vec<&Estimate> = objects.values().flatten().copied().collect();
     by_falling_score(&mut all, |e| e.score);

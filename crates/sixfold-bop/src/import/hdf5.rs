@@ -1,13 +1,13 @@
-//! Datasets of an HDF5 file as h5py writes them where nothing else is asked for: superblock 0, one group with a symbol table,
-//! contiguous or compact datasets of integers, floating-point numbers or booleans.
+//! Datasets of an HDF5 file as h5py writes them by default: superblock 0, one group with a symbol table, contiguous or compact
+//! datasets of integers, floating-point numbers or booleans.
 //!
-//! That is what NOL's scripts write, and all of it that is read: chunks, compression, nested groups and the newer file format
+//! NOL's scripts write this form, and only this form is read: chunks, compression, nested groups and the newer file format
 //! (`libver="latest"`) are refused with a message. Layout: HDF5 File Format Specification 1.1 (The HDF Group), whose sections are
 //! named below. Nothing is read outside the file, and no loop is longer than the file.
 
 use std::collections::BTreeMap;
 
-/// What is wrong with a file, and where.
+/// Why a file cannot be read, and where.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Hdf5Error {
     /// The dataset, or a part of the file.
@@ -47,7 +47,7 @@ pub(super) struct Dataset {
     pub whole: bool,
 }
 
-/// What the elements are.
+/// The type of the elements.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Element {
     float: bool,
@@ -60,7 +60,7 @@ fn wrong<T>(field: &str, found: impl Into<String>, expected: &'static str) -> Re
     Err(Hdf5Error { field: field.to_owned(), found: found.into(), expected })
 }
 
-/// Bytes of the file, which may end anywhere.
+/// `length` bytes of the file from `start`; an error where the file is shorter.
 fn at<'a>(bytes: &'a [u8], field: &str, start: u64, length: u64) -> Result<&'a [u8]> {
     let end = start.checked_add(length).filter(|end| *end <= bytes.len() as u64);
     let Some(end) = end else {
@@ -110,7 +110,7 @@ impl<'a> Hdf5File<'a> {
         Ok(file)
     }
 
-    /// The datasets of a B-tree of version 1 (section III.A.1); `budget`: bytes that its nodes may still have.
+    /// The datasets of a B-tree of version 1 (section III.A.1); `budget`: bytes that its nodes may still take.
     fn tree(&mut self, node: u64, names: (u64, u64), budget: &mut usize) -> Result<()> {
         let mut open = vec![node];
         while let Some(node) = open.pop() {
@@ -122,7 +122,7 @@ impl<'a> Hdf5File<'a> {
                 [b'T', b'R', b'E', b'E', 0, ..] => {
                     let used = number(self.bytes, "B-tree", node + 6, 2)?;
                     for entry in (0..used).rev() {
-                        // Signature to right sibling: 24 bytes; then key and child in turns.
+                        // Signature to right sibling: 24 bytes; then keys and children alternate.
                         open.push(number(self.bytes, "B-tree", node + 24 + 16 * entry + 8, 8)?);
                         *budget = budget.saturating_sub(16);
                     }
@@ -163,7 +163,7 @@ impl<'a> Hdf5File<'a> {
         let size = number(self.bytes, field, header + 8, 4)?;
         let mut blocks = vec![(header + 16, size)];
         let mut messages = vec![];
-        // Each block is part of the file: more of them than bytes are a loop.
+        // Each block is part of the file: if the blocks take more bytes than the file has, there is a loop.
         let mut budget = self.bytes.len() as u64;
         while let Some((start, length)) = blocks.pop() {
             at(self.bytes, field, start, length)?;
@@ -209,7 +209,7 @@ impl<'a> Hdf5File<'a> {
         Ok(Dataset { shape, values, whole: !element.float })
     }
 
-    /// The bytes that a layout message names (section IV.A.2.i).
+    /// The bytes that a layout message refers to (section IV.A.2.i).
     fn data(&self, name: &str, layout: &'a [u8], length: u64) -> Result<&'a [u8]> {
         match (number(layout, name, 0, 1)?, number(layout, name, 1, 1)?) {
             (3, 0) => {
@@ -231,7 +231,7 @@ impl<'a> Hdf5File<'a> {
     }
 }
 
-/// The sides of a dataspace message (section IV.A.2.b).
+/// The dimensions in a dataspace message (section IV.A.2.b).
 fn shape(name: &str, message: &[u8]) -> Result<Vec<u64>> {
     let (version, rank) = (number(message, name, 0, 1)?, number(message, name, 1, 1)?);
     let first = match version {
@@ -242,7 +242,7 @@ fn shape(name: &str, message: &[u8]) -> Result<Vec<u64>> {
     (0..rank).map(|axis| number(message, name, first + 8 * axis, 8)).collect()
 }
 
-/// The element of a datatype message (section IV.A.2.d).
+/// The element type in a datatype message (section IV.A.2.d).
 fn element(name: &str, message: &[u8]) -> Result<Element> {
     const KNOWN: &str = "integers, 32 or 64 bit floating-point numbers, or booleans";
     let class = number(message, name, 0, 1)? & 0x0f;

@@ -24,7 +24,7 @@ const DEPTH_SCALE: f64 = 0.000_124_986_647_279_001_77;
 /// Largest meta file, bytes: they have about 10 kB.
 const MAX_META: u64 = 4 << 20;
 
-/// Which part of HO-3D is taken.
+/// Which part of HO-3D is converted.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Ho3dOptions {
     /// `train` or `evaluation`.
@@ -37,7 +37,7 @@ pub struct Ho3dOptions {
     pub every: usize,
 }
 
-/// What a meta file says of an annotated frame.
+/// The content of the meta file of an annotated frame.
 #[derive(Debug, Clone, PartialEq)]
 struct Meta {
     fx: f64,
@@ -48,8 +48,8 @@ struct Meta {
     object: String,
 }
 
-/// Converts a folder of HO-3D. An object's id is the number its YCB name begins with. Masks of what is visible come from the depth
-/// images: hands hide objects.
+/// Converts a folder of HO-3D. An object's id is the number its YCB name begins with. Masks of visible parts are computed from the
+/// depth images, because hands occlude objects.
 ///
 /// # Errors
 /// [`DatasetError`] naming file and field.
@@ -70,7 +70,7 @@ pub fn import_ho3d(
         ));
     }
     let mut chosen = vec![];
-    // Numbers are those among all sequences: one alone keeps its own.
+    // Scenes are numbered among all sequences, so a sequence that is converted alone keeps its number.
     for (scene_id, (name, folder)) in (1..).zip(sequences) {
         if options.sequences.is_empty() || options.sequences.contains(&name) {
             let images = images_in(&folder.join("rgb"), options.every)?;

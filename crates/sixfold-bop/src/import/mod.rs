@@ -1,6 +1,7 @@
-//! Datasets of other formats, rewritten as BOP datasets: every method and every score then works with them.
+//! Conversion of other datasets to BOP datasets, so that every method and every score works with them.
 //!
-//! Only what is read is documented by the authors' own scripts; each file says where. Nothing of the source is changed.
+//! The formats are documented only by the authors' scripts that read them; each file names its script. The source is
+//! not changed.
 
 mod hdf5;
 mod ho3d;
@@ -28,7 +29,7 @@ pub use ho3d::{Ho3dOptions, import_ho3d};
 pub use nol::{NolOptions, import_nol};
 pub use smot::{SmotOptions, import_smot};
 
-/// What was converted.
+/// Summary of a conversion.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
 pub struct ImportSummary {
     /// Scenes, one for each sequence.
@@ -37,7 +38,7 @@ pub struct ImportSummary {
     pub images: usize,
     /// Ids of the objects.
     pub objects: BTreeSet<u32>,
-    /// Images that were left out: nothing is annotated there.
+    /// Images that were left out because they have no annotated pose.
     pub without_poses: usize,
 }
 
@@ -49,7 +50,8 @@ struct NewFrame<'a> {
     rgb_file: Option<&'a Path>,
     rgb: Option<&'a RgbImage>,
     depth: Option<&'a DepthImage>,
-    /// The visible part of the only object; otherwise computed from depth and models.
+    /// The mask of the visible part, for images with one object; without it, visibility is computed from depth and
+    /// models.
     mask: Option<&'a Mask>,
     ground_truth: &'a [GroundTruth],
 }
@@ -189,14 +191,14 @@ impl Importer {
         write_atomically(&path, &bytes).map_err(|source| DatasetError::Write { path, source })
     }
 
-    /// Writes what belongs to all scenes.
+    /// Writes the files that belong to all scenes.
     fn finish(self) -> Result<ImportSummary, DatasetError> {
         let info = self.out.join("models").join("models_info.json");
         self.infos.write(&info).map_err(|e| DatasetError::Model(Box::new(e)))?;
         let path = self.out.join("scenes.json");
         let text = format!("{:#}\n", json!(self.names));
         write_atomically(&path, text.as_bytes()).map_err(|source| DatasetError::Write { path, source })?;
-        // With images of several sizes it would be wrong for some.
+        // With images of several sizes, one camera file would be wrong for some.
         if self.cameras.len() == 1 {
             for camera in self.cameras.values() {
                 write_camera(&self.out, camera, self.depth_scale)?;
@@ -221,7 +223,7 @@ fn of_mask(info: &GroundTruthInfo, mask: &Mask) -> GroundTruthInfo {
     }
 }
 
-/// Reads a file of at most so many bytes.
+/// Reads a file of at most `limit` bytes.
 fn read_bytes(path: &Path, limit: u64) -> Result<Vec<u8>, DatasetError> {
     sixfold_io::read_regular(path, limit)
         .map_err(|source| DatasetError::Read { path: path.to_owned(), source })
@@ -282,7 +284,7 @@ fn image_size(at: &At<'_>, camera: &Map<String, Value>) -> Result<(usize, usize)
     Ok((side("width")?, side("height")?))
 }
 
-/// An error for focal lengths that are none in pixels, or that a BOP dataset could not hold.
+/// An error for focal lengths that cannot be in pixels, or that a BOP dataset could not store.
 fn of_pixels(at: &At<'_>, field: &str, (fx, fy): (f64, f64)) -> Result<(), DatasetError> {
     if fx > 0.0 && fy > 0.0 && (0.5..=2.0).contains(&(fx / fy)) {
         return Ok(());
@@ -296,13 +298,13 @@ fn of_pixels(at: &At<'_>, field: &str, (fx, fy): (f64, f64)) -> Result<(), Datas
 pub mod parsers {
     use super::{hdf5, pickle};
 
-    /// Reads a pickle; whether it is a dictionary.
+    /// Reads a pickle; returns whether it is a dictionary.
     pub fn pickle(bytes: &[u8]) -> bool {
         let keys = ["camMat", "objRot", "objTrans", "objName"];
         pickle::PickledDict::parse(bytes).is_ok_and(|dict| keys.iter().all(|key| dict.get(key).is_some()))
     }
 
-    /// Reads an HDF5 file and the datasets of these names; how many numbers they hold.
+    /// Reads an HDF5 file and the datasets of these names; returns how many numbers they hold.
     pub fn hdf5(bytes: &[u8], names: &[&str]) -> Option<usize> {
         let file = hdf5::Hdf5File::parse(bytes).ok()?;
         Some(names.iter().filter_map(|name| file.dataset(name).ok()).map(|d| d.values.len()).sum())

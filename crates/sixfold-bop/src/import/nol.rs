@@ -2,7 +2,7 @@
 //!
 //! A file is one object: `vertices_3d` Vx3 in metres, `faces` Fx3, `images` NxSxSx3 (0 to 1, or 0 to 255 as integers), `poses`
 //! Nx4x4 in metres, `masks` NxSxSx1, `bboxes` Nx4 (first row, first column, last row, last column, both last ones exclusive): the
-//! part of the camera's image that was resized to SxS. Here each image has a camera of its own, that of its part.
+//! part of the camera's image that was resized to SxS. In the BOP dataset each image has its own camera, that of its part.
 
 use std::path::{Path, PathBuf};
 
@@ -19,7 +19,7 @@ use crate::scene_files::GroundTruth;
 /// Largest file, bytes: sixteen images of 256x256 pixels take 25 MB.
 const MAX_FILE: u64 = 256 << 20;
 
-/// What a file of NOL does not say.
+/// Options for what a NOL file does not contain.
 #[derive(Debug, Clone, PartialEq)]
 pub struct NolOptions {
     /// The camera of the whole images: `width`, `height` and `cam_K`, nine numbers row by row, as in the author's `cfg_camera`.
@@ -67,7 +67,7 @@ pub fn import_nol(
     importer.finish()
 }
 
-/// A camera of the author's form; its last row is not read, one of his files has zeros there.
+/// A camera file in the author's form. The last row of the matrix is not read: one of the author's files has zeros there.
 fn read_camera(path: &Path) -> Result<Camera, DatasetError> {
     let at = At::file(path);
     let json = parse(&read_bytes(path, sixfold_io::limits::SMALL_TEXT)?, path)?;

@@ -1,4 +1,4 @@
-//! numpy's arrays of numbers, from the bytes that files have of them.
+//! numpy's arrays of numbers, decoded from the bytes in files.
 
 /// The type of an array's elements.
 #[derive(Debug, Clone, PartialEq)]
@@ -42,7 +42,7 @@ impl ElementType {
 }
 
 impl Array {
-    /// An array from its bytes, column by column if `fortran`; `None` if they are not as many as the shape has.
+    /// An array from its bytes, column by column if `fortran`; `None` if their number does not match the shape.
     pub(super) fn of_bytes(shape: &[usize], of: &ElementType, fortran: bool, bytes: &[u8]) -> Option<Array> {
         let count = shape.iter().try_fold(1usize, |count, side| count.checked_mul(*side))?;
         if count.checked_mul(of.size)? != bytes.len() {
@@ -56,12 +56,12 @@ impl Array {
     }
 }
 
-/// An array that was stored column by column.
+/// Converts an array stored column by column to row by row.
 fn row_by_row(shape: &[usize], values: &[f64]) -> Vec<f64> {
     (0..values.len())
         .map(|mut index| {
             let mut at = 0;
-            // The last side runs fastest in `index`, the first in `values`.
+            // The last axis varies fastest in `index`, the first axis in `values`.
             for axis in (0..shape.len()).rev() {
                 let before: usize = shape[..axis].iter().product();
                 at += (index % shape[axis]) * before;

@@ -2,8 +2,8 @@
 //!
 //! `camera_intrinsic.json` holds width, height and `intrinsic_matrix`, nine numbers column by column. A split (`train`, `test`) has
 //! folders `seq1`, `seq2`, ... with `scene_gt.json` as in BOP, but in metres, `color/000000.png` and `depth/000000.png` in
-//! millimetres. Models are `models/obj_01.ply` in metres. So the author's script reads it (kirumang/NOL, `process_SMOT.py`), which opens
-//! the sequences of `train`; those of `test` are taken to be laid out alike.
+//! millimetres. Models are `models/obj_01.ply` in metres. This is how the author's script reads it (kirumang/NOL,
+//! `process_SMOT.py`). The script opens the sequences of `train` only; those of `test` are assumed to have the same layout.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -22,10 +22,10 @@ use crate::scene_files::GroundTruth;
 
 /// Metres per unit of depth.
 const DEPTH_SCALE: f64 = 1e-3;
-/// Translations beyond this are no metres, metres.
+/// Longest plausible translation in metres: longer ones are not in metres.
 const FARTHEST: f64 = 20.0;
 
-/// Which part of SMOT is taken.
+/// Which part of SMOT is converted.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SmotOptions {
     /// `train` or `test`.
@@ -34,7 +34,7 @@ pub struct SmotOptions {
     pub every: usize,
 }
 
-/// Converts a split of SMOT. A scene has its sequence's number; masks of what is visible come from the depth images.
+/// Converts a split of SMOT. A scene has its sequence's number; masks of visible parts are computed from the depth images.
 ///
 /// # Errors
 /// [`DatasetError`] naming file and field.
@@ -137,7 +137,7 @@ fn parse_truth(text: &[u8], path: &Path) -> Result<BTreeMap<u32, Vec<GroundTruth
 fn pose_of(at: &At<'_>, entry: &Value) -> Result<GroundTruth, DatasetError> {
     let map = at.object(entry)?;
     let id = at.get(map, "obj_id", "a whole number")?;
-    // Some files have it as text.
+    // Some files store the id as text.
     let obj_id = match id.as_str().map(str::parse) {
         Some(Ok(id)) => id,
         Some(Err(_)) => return Err(at.error("obj_id", describe(id), "a whole number")),

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-/// A folder of the shared data; prints why and returns `None` when it is not there.
+/// A folder of the shared data; prints a message and returns `None` if it does not exist.
 pub fn data(name: &str) -> Option<PathBuf> {
     let root = std::env::var_os("SIXFOLD_DATA").map_or_else(
         || PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../../shared/data"),

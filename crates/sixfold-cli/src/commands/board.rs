@@ -10,7 +10,7 @@ use sixfold_io::write_rgb;
 use sixfold_shell::Outcome;
 use sixfold_shell::output::{JsonArguments, report, write_atomically};
 
-/// Pixels a millimetre of the PNG: 24 for a cell of a tag.
+/// Pixels per millimetre of the PNG: 24 for a cell of a tag.
 const DOTS: f64 = 8.0;
 
 #[derive(Debug, Args)]

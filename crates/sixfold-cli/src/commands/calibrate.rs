@@ -1,4 +1,4 @@
-//! `sixfold calibrate`: a camera, and where it was, from photographs of the board.
+//! `sixfold calibrate`: a camera's intrinsics and poses from photographs of the board.
 
 use std::path::{Path, PathBuf};
 

@@ -1,5 +1,5 @@
-//! `sixfold detect`: boxes and masks of a detector's objects, in images, of which nothing is written before the end, or in all
-//! of a dataset, resumable.
+//! `sixfold detect`: boxes and masks of a detector's objects, in single images (written at the end) or in all images of a
+//! dataset (resumable).
 
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -35,7 +35,7 @@ struct Many {
 
 #[derive(Serialize)]
 struct OneOfMany {
-    /// Its place, from 1.
+    /// Its index, from 1.
     image: u32,
     file: PathBuf,
     detections: Vec<FoundDetection>,
@@ -52,7 +52,7 @@ struct Whole {
 
 pub(crate) fn run(a: &DetectArguments) -> Result<Outcome> {
     without_duplicates("--ids", &a.ids)?;
-    // The weights are hashed before they are read: what changes in between is never taken for the same.
+    // The weights are hashed before they are read, so that a change in between is noticed.
     let of_run = run_options(a);
     let model = DetectorModel::load(&a.weights)?;
     for id in &a.ids {
@@ -79,9 +79,9 @@ pub(crate) fn run(a: &DetectArguments) -> Result<Outcome> {
     }
 }
 
-/// What decides about the detections of an image. Which images are searched does not.
+/// The options on which the detections of an image depend. The choice of images is not among them.
 fn run_options(a: &DetectArguments) -> RunOptions {
-    // All fields, so that a new one is decided about.
+    // All fields are listed, so that a new one has to be considered.
     let DetectArguments {
         weights,
         dataset,
@@ -115,7 +115,7 @@ fn run_options(a: &DetectArguments) -> RunOptions {
     options
 }
 
-/// The outcome of so many detections.
+/// The outcome for a number of detections.
 fn outcome(detections: usize, skipped: &[String]) -> Outcome {
     match (skipped.is_empty(), detections) {
         (false, _) => Outcome::Incomplete,
@@ -124,7 +124,7 @@ fn outcome(detections: usize, skipped: &[String]) -> Outcome {
     }
 }
 
-/// An image, what is seen in it as number `image`, and in how many seconds.
+/// Reads and searches an image; returns it, its detections under the number `image`, and the seconds it took.
 fn look(
     a: &DetectArguments,
     detector: &TrainedDetector,
@@ -174,7 +174,7 @@ fn in_image(a: &DetectArguments, detector: &TrainedDetector, file: &Path) -> Res
     Ok(pictures.outcome(outcome(whole.detections.len(), &[])))
 }
 
-/// Several images that belong to no dataset; in `detections.json` their ids are their places, from 1.
+/// Several images outside datasets; in `detections.json` their ids are their indices, from 1.
 fn in_images(a: &DetectArguments, detector: &TrainedDetector, files: &[PathBuf]) -> Result<Outcome> {
     let mut folder = a.out.as_deref().map(OutputFolder::take).transpose()?;
     let file = folder.as_mut().map(|f| f.file("detections.json")).transpose()?;
@@ -232,7 +232,7 @@ fn in_dataset(
         bail!("--out: found {}, expected a file that ends in .json", out.display());
     }
     let dataset = BopDataset::open(root, &a.split)?;
-    // The images of the targets, or all of a dataset without targets, but those of `--except`.
+    // The images of the targets, or all images of a dataset without targets, except those of `--except`.
     let mut images = dataset.images(a.targets.as_deref().or(dataset.targets_file().as_deref()))?;
     for image in excepted(&dataset, a.except.as_deref())? {
         images.remove(&image);

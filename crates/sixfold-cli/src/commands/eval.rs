@@ -98,7 +98,7 @@ fn vsd_tau(text: &str) -> Result<f64, String> {
     tau.ok_or_else(|| format!("found {text}, expected millimetres above 0, at most 1000"))
 }
 
-/// What all objects are called where their names count for nothing.
+/// The id of all objects when object ids are ignored.
 const ANY_OBJECT: u32 = 0;
 
 #[derive(Serialize)]
@@ -160,7 +160,7 @@ pub(crate) fn run(a: &EvalArguments) -> Result<Outcome> {
     }))
 }
 
-/// How the options say that poses are scored.
+/// The evaluation options from the command line.
 fn options(a: &EvalArguments) -> Result<EvalOptions> {
     let usual = EvalOptions::for_dataset(&a.dataset);
     let mut options = if a.preset.is_some() { EvalOptions::published() } else { usual };
@@ -178,7 +178,7 @@ fn options(a: &EvalArguments) -> Result<EvalOptions> {
     Ok(options)
 }
 
-/// Box and mask AP of detections, in COCO's terms.
+/// COCO's box and mask AP of detections.
 fn coco(a: &EvalArguments, dataset: &BopDataset) -> Result<Outcome> {
     let path = a.detections.as_deref().ok_or_else(|| anyhow!("--detections FILE.json is missing"))?;
     let mut read = dataset.detections(path, a.lenient)?;

@@ -1,5 +1,5 @@
-//! `sixfold reproduce`, `sixfold grasp compare` and `sixfold grasp measure`: run by the program `sixfold-experiments`, which is
-//! built and installed by itself, with the same arguments.
+//! `sixfold reproduce`, `sixfold grasp compare` and `sixfold grasp measure`: run by the separate program `sixfold-experiments`
+//! with the same arguments.
 
 use std::ffi::OsString;
 use std::path::PathBuf;
@@ -9,7 +9,7 @@ use anyhow::{Context, Result, bail};
 use clap::Args;
 use sixfold_shell::Outcome;
 
-/// The program that knows the command.
+/// The program that has the command.
 const PROGRAM: &str = "sixfold-experiments";
 
 /// Whatever follows is for the other program.
@@ -38,7 +38,7 @@ pub(crate) fn run() -> Result<Outcome> {
     become_it(command).with_context(|| format!("cannot run {}", program.display()))
 }
 
-/// Beside this program, or on PATH.
+/// The program beside this one, or on PATH.
 fn find() -> Option<PathBuf> {
     let name = format!("{PROGRAM}{}", std::env::consts::EXE_SUFFIX);
     let beside = std::env::current_exe().ok().and_then(|me| Some(me.parent()?.join(&name)));
@@ -49,7 +49,7 @@ fn find() -> Option<PathBuf> {
 
 #[cfg(unix)]
 fn become_it(mut command: Command) -> Result<Outcome> {
-    // Comes back only when it did not work.
+    // This returns only on failure.
     Err(std::os::unix::process::CommandExt::exec(&mut command).into())
 }
 

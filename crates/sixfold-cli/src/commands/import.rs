@@ -1,4 +1,4 @@
-//! `sixfold import`: datasets of other formats as BOP datasets.
+//! `sixfold import`: converts datasets of other formats to BOP datasets.
 
 use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
@@ -16,7 +16,7 @@ use sixfold_shell::output::{JsonArguments, report};
 use sixfold_shell::progress::{Bar, check_interrupt};
 use sixfold_shell::ranges::{count, folder_name};
 
-/// Written last: without it an import was stopped.
+/// Written last: if it is missing, an import was interrupted.
 const SCENES: &str = "scenes.json";
 
 #[derive(Debug, Args)]
@@ -143,7 +143,7 @@ pub(crate) fn run(a: &ImportArguments) -> Result<Outcome> {
     }
 }
 
-/// Runs an import into a folder of its own. A stopped one is made again as a whole.
+/// Runs an import into a new folder. An interrupted import is repeated as a whole.
 fn convert(
     out: &Path,
     inputs: &[&Path],

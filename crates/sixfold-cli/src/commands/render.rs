@@ -1,4 +1,4 @@
-//! `sixfold render`: what the renderer sees of one object, as images.
+//! `sixfold render`: renderings of one object as images.
 
 use std::path::PathBuf;
 

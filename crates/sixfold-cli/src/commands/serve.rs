@@ -1,11 +1,11 @@
-//! `sixfold serve`: the server of `sixfold-serve`, until it is interrupted.
+//! `sixfold serve`: runs the server of `sixfold-serve` until it is interrupted.
 
 #[cfg(feature = "serve")]
 pub(crate) use built_in::{AFTER_HELP, ServeArguments, run};
 #[cfg(not(feature = "serve"))]
 pub(crate) use left_out::{AFTER_HELP, ServeArguments, run};
 
-/// Whether the command is built in; without it says so, and help does not list it.
+/// Whether the command is built in. Otherwise it prints a message, and help does not list it.
 pub(crate) const IS_BUILT_IN: bool = cfg!(feature = "serve");
 
 #[cfg(feature = "serve")]
@@ -100,7 +100,7 @@ mod left_out {
     use clap::Args;
     use sixfold_shell::Outcome;
 
-    /// Nothing can be said of how to use a command that is not there.
+    /// Empty, because the command is not built in.
     pub(crate) const AFTER_HELP: &str = "";
 
     /// Whatever is asked, the answer is the same.

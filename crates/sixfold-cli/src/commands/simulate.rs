@@ -1,4 +1,4 @@
-//! `sixfold simulate-depth`: what a depth camera would have measured in a dataset that has poses but no depth.
+//! `sixfold simulate-depth`: simulated depth images for a dataset that has poses but no depth.
 
 use std::path::PathBuf;
 
@@ -31,7 +31,7 @@ pub(crate) enum Sensor {
 }
 
 impl Sensor {
-    /// Its noise; none for an ideal camera.
+    /// Its noise; `None` for an ideal camera.
     pub fn model(self) -> Option<DepthSensor> {
         match self {
             Sensor::Ideal => None,
@@ -80,7 +80,7 @@ pub(crate) struct SimulateArguments {
 }
 
 impl SimulateArguments {
-    /// The options that decide about the result.
+    /// The options on which the result depends.
     fn deciding(&self) -> Value {
         json!({
             "dataset": self.dataset, "split": self.split, "sensor": format!("{:?}", self.sensor), "rgb": self.rgb,
@@ -92,7 +92,7 @@ impl SimulateArguments {
 pub(crate) fn run(a: &SimulateArguments) -> Result<Outcome> {
     without_duplicates("--images", &a.images)?;
     let dataset = datasets::open(&a.dataset, &a.split, a.models.as_deref())?;
-    // Written last: without it a run was stopped, and this one makes all of it again.
+    // Written last: if it is missing, a run was interrupted, and this one repeats everything.
     let targets_file = a.out.join("test_targets_bop19.json");
     if targets_file.exists() {
         bail!("{} exists already: remove it or choose another --out", a.out.join(&a.split).display());

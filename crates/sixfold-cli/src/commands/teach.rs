@@ -84,7 +84,7 @@ struct Taught<'a> {
     name: &'a str,
     #[serde(flatten)]
     record: &'a ObjectRecord,
-    /// Photographs that are used.
+    /// Number of used photographs.
     photographs: usize,
     left_out: Vec<LeftOut>,
     /// Fraction of the surface that no photograph shows.
@@ -137,7 +137,7 @@ pub(crate) fn run(a: &TeachArguments) -> Result<Outcome> {
     Ok(Outcome::Found)
 }
 
-/// What was given, as files.
+/// The files that the arguments name.
 fn files(a: &TeachArguments) -> TeachingFiles<'_> {
     TeachingFiles {
         photographs: &a.photographs,

@@ -1,4 +1,4 @@
-//! In the place of the commands that need a network when the feature `networks` is off: they say so.
+//! Replaces the commands that need a network when the feature `networks` is off: they print a message.
 
 use std::ffi::OsString;
 
@@ -19,7 +19,7 @@ pub(crate) type SynthesizeArguments = Unanswered;
 pub(crate) type TeachArguments = Unanswered;
 pub(crate) type TrainArguments = Unanswered;
 
-/// Nothing can be said of how to use a command that is not there.
+/// Empty, because the command is not built in.
 pub(crate) const AFTER_HELP: &str = "";
 
 pub(crate) fn run(_: &Unanswered) -> Result<Outcome> {

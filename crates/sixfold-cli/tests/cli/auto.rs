@@ -28,10 +28,10 @@ fn says_how_probable_a_pose_is_and_what_is_not_there() {
 
     let table = sixfold(dir, &format!("{DEPTH} --object part.ply")).expect(0).stdout;
     assert!(table.starts_with("object") && table.contains(" probability "), "{table}");
-    // Methods that know no probability say none.
+    // Methods without probabilities report none.
     let table = sixfold(dir, &format!("{} --method ppf", OneImage::ARGUMENTS)).expect(0).stdout;
     assert!(table.contains(" confidence ") && !table.contains("probability"), "{table}");
-    // What is not there is nothing found.
+    // An absent object gives "nothing found".
     sixfold(dir, &format!("{DEPTH} --object other.ply")).expect(1);
 }
 
@@ -43,7 +43,7 @@ fn write_other_part(dir: &std::path::Path) {
 fn the_same_on_any_number_of_threads() {
     let case = OneImage::new();
     let args = format!("{DEPTH} --rgb rgb.png --object part.ply --json");
-    // A colour image without anything in it says nothing.
+    // A uniform colour image carries no information.
     let flat = sixfold(case.path(), &args).expect(0);
     assert!(
         flat.stderr.contains("the colour image has one colour everywhere: colours are not used"),
@@ -51,7 +51,7 @@ fn the_same_on_any_number_of_threads() {
         flat.stderr
     );
     assert!(flat.json()["poses"][0]["evidence"]["edges"].is_null());
-    // One that shows something else speaks against the object, whatever depth says.
+    // An image of something else is evidence against the object, even if depth agrees.
     let squares =
         RgbImage::from_fn(WIDTH, HEIGHT, |x, y| [if (x / 16 + y / 16) % 2 == 0 { 30 } else { 220 }; 3]);
     write_rgb(&case.path().join("rgb.png"), &squares).unwrap();

@@ -1,11 +1,11 @@
-//! Broken, missing and lying input: exit status 2, a message that names file and field, never a panic
-//! (`sixfold` in `support` looks for that after every run).
+//! Broken, missing and contradictory input: exit status 2, a message that names file and field, never a panic
+//! (`sixfold` in `support` checks this after every run).
 
 use std::path::Path;
 
 use crate::support::*;
 
-/// `estimate` on the one image fails with these words after `spoil` has been at the folder.
+/// `estimate` on the one image fails with these words after `spoil` has changed the folder.
 fn estimate_fails(spoil: impl FnOnce(&Path), more: &str, words: &[&str]) {
     let case = OneImage::new();
     spoil(case.path());
@@ -185,7 +185,7 @@ fn intrinsics_of_another_resolution() {
     );
 }
 
-/// A focal length of half a pixel gave a pose 597 m behind the camera, one of 1e-5 pixels a panic.
+/// A focal length of half a pixel once gave a pose 597 m behind the camera, one of 1e-5 pixels a panic.
 #[test]
 fn impossible_cameras() {
     for (numbers, words) in [
@@ -253,14 +253,14 @@ fn broken_object_in_the_store() {
     truncate(&dir.join("sixfold-objects/part/mesh.ply"), 0.5);
     fails(dir, "render --object part", &["mesh.ply"]);
 
-    // A broken description is only a copy: it is made again, with a note.
+    // A broken description can be computed again, with a note.
     sixfold(dir, "object add part part.ply --unit mm --replace").expect(0);
     truncate(&dir.join("sixfold-objects/part/ppf.bin"), 0.5);
     let run = sixfold(dir, "estimate --depth depth.png --camera camera.json --object part").expect(0);
     assert!(run.stderr.contains("description of part"), "{}", run.stderr);
 }
 
-/// `command` on the dataset fails with these words after `spoil` has been at it.
+/// `command` on the dataset fails with these words after `spoil` has changed it.
 fn dataset_fails(spoil: impl FnOnce(&Tiny), command: &str, words: &[&str]) {
     let tiny = Tiny::new(true);
     tiny.write_truth_as_results("results.csv");
@@ -428,9 +428,9 @@ fn options_that_would_be_ignored_are_refused() {
         let arguments = arguments.replace("ONE", one).replace("FOUND", found);
         fails(dir.path(), &arguments, &[&format!("{option} has no effect"), reason]);
     }
-    // It is no option where nothing shows colours.
+    // The option does not exist for commands without colour.
     fails(dir.path(), "grasp store add e.db --rgb c.png", &["unexpected argument", "--rgb"]);
-    // What stands in the environment is meant for other commands.
+    // Options from the environment may be meant for other commands.
     let mut command = std::process::Command::new(crate::PROGRAM);
     command.args(["grasp", "propose", "--depth", "d.png", "--camera", "c.json"]).current_dir(dir.path());
     let output = command.env("SIXFOLD_DGCM", "w.safetensors").output().unwrap();

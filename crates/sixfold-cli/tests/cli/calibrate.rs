@@ -31,7 +31,7 @@ fn pose(i: u32) -> Pose {
     Pose::new(rotation, Vec3::new(0.0, 0.01, 0.36 + 0.01 * f64::from(i)))
 }
 
-/// Seven photographs of the board, something in its middle.
+/// Seven photographs of the board with an object at its centre.
 fn write_photographs(folder: &Path) {
     std::fs::create_dir(folder).unwrap();
     let conditions = Conditions { hidden: (0.01, 0.0, 0.035), ..Conditions::default() };
@@ -74,7 +74,7 @@ fn photographs_of_the_board_give_the_camera_and_its_poses() {
     for file in ["camera.json", "photographs.json", "photographs.png", "residuals.png"] {
         assert!(case.path().join("out").join(file).metadata().unwrap().len() > 100, "{file}");
     }
-    // The camera file is one that the program takes, and with it come the same poses; a larger print is further away.
+    // The program accepts the camera file, and with it the poses are the same; a larger print is further away.
     let again = "calibrate photographs --camera out/camera.json --out again --json";
     let again = sixfold(case.path(), again).expect(0).json();
     let larger = "calibrate photographs --camera out/camera.json --ruler 141.4 --out larger --json";
@@ -110,7 +110,7 @@ fn photographs_that_cannot_be_used_are_left_out_with_the_reason() {
     assert!(reason("small.png").contains("600x440"));
     assert!(reason("table.png").contains("0 tags"));
     assert_eq!(reason("0.png"), "");
-    // A file that is no image is named, and the rest is done.
+    // A file that is not an image is reported, and the others are used.
     std::fs::write(photographs.join("notes.jpg"), "no image").unwrap();
     std::fs::write(photographs.join("phone.heic"), b"\0\0\0\x18ftypheic\0\0\0\0mif1heic").unwrap();
     let found = sixfold(case.path(), "calibrate photographs --out out --json").expect(2).json();

@@ -67,12 +67,12 @@ fn a_cut_off_run_goes_on_to_the_same_result() {
     assert!(run.stderr.contains("cut off"), "{}", run.stderr);
     assert_eq!(rows(&csv), whole);
 
-    // Nothing is left to do: the file stays as it is, to the byte.
+    // Nothing is left to do: the file does not change by a byte.
     let before = std::fs::read(&csv).unwrap();
     sixfold(tiny.path(), ARGUMENTS).expect(0);
     assert_eq!(std::fs::read(&csv).unwrap(), before);
 
-    // Another seed is another run, and not mixed with this one.
+    // A run with another seed is not mixed with this one.
     fails(tiny.path(), &format!("{ARGUMENTS} --seed 5"), &["results.csv", "other options"]);
     std::fs::remove_file(&record).unwrap();
     fails(tiny.path(), ARGUMENTS, &["results.csv", "results.csv.run.json"]);
@@ -85,7 +85,7 @@ fn an_image_torn_between_its_rows_is_done_again() {
     let csv = tiny.path().join("results.csv");
     sixfold(tiny.path(), ARGUMENTS).expect(0);
     let whole = rows(&csv);
-    // The first of two rows of the second image is on disk, the record does not name the image yet.
+    // The first of two rows of the second image is on disk, the image is not in the record yet.
     let record = tiny.path().join("results.csv.run.json");
     let mut value: Value = serde_json::from_slice(&std::fs::read(&record).unwrap()).unwrap();
     value["done"] = serde_json::json!([]);
@@ -125,7 +125,7 @@ fn masks_of_detections_say_more_than_their_boxes() {
     let (meshes, posed) = ([part(), other_part()], [1, 2].map(|id| tiny.truth_of(4, id)));
     let posed: Vec<_> = meshes.iter().zip(posed).collect();
     let masks = ground_truth_visibility(&posed, &camera(), None, VISIBILITY_DELTA);
-    // The box is the whole image; only the mask says where in it.
+    // The box is the whole image; only the mask gives the position.
     let found = |mask: Option<&Mask>| {
         let detection = Detection {
             scene_id: 7,
@@ -146,7 +146,7 @@ fn masks_of_detections_say_more_than_their_boxes() {
     };
     assert!(found(None).1.unwrap() < 0.005);
     assert!(found(Some(&masks[1].mask_visible)).1.unwrap() < 0.005);
-    // Where the other object is, this one cannot be.
+    // This object cannot be at the place of the other one.
     assert!(found(Some(&masks[0].mask_visible)).1.is_none_or(|off| off > 0.05));
     let (run, none) = found(Some(&Mask::filled(7, 5, true)));
     assert!(none.is_none());
@@ -168,7 +168,7 @@ fn a_broken_image_is_skipped_and_the_rest_finished() {
         |file| read_results(&tiny.path().join(file)).unwrap().iter().map(|r| r.im_id).collect::<Vec<_>>();
     assert_eq!(done("results.csv"), [0, 0, 11, 11]);
 
-    // Once the image is mended, the same command finishes the run.
+    // Once the image is repaired, the same command finishes the run.
     let whole = Tiny::new(true);
     let name = "test/000007/depth/000004.png";
     std::fs::copy(whole.file(name), tiny.file(name)).unwrap();
@@ -226,11 +226,11 @@ fn stale_rows_of_changed_inputs_are_refused_by_name() {
     };
     refused(targets, &fewer, ["list of targets of image 7/11", "tiny"]);
 
-    // As it was: nothing is left to do.
+    // Unchanged inputs: nothing is left to do.
     sixfold(tiny.path(), ARGUMENTS).expect(0);
     assert!(std::fs::read(&csv).unwrap() == before);
 
-    // Boxes of the ground truth are an input too, and so is the content of a file of boxes.
+    // Boxes of the ground truth are an input too, as is the content of a file of boxes.
     sixfold(tiny.path(), &format!("{} --boxes gt", ARGUMENTS.replace("results", "gt"))).expect(0);
     let truth = tiny.file("test/000007/scene_gt.json");
     let whole = std::fs::read(&truth).unwrap();
@@ -250,7 +250,7 @@ fn two_runs_on_one_result_file_do_not_mix_their_rows() {
     assert!(!csv.exists());
     drop(other);
 
-    // Both at once: one is refused, or comes after the other.
+    // Both at once: one is refused, or runs after the other.
     let both = std::thread::scope(|scope| {
         let run = || sixfold(tiny.path(), ARGUMENTS);
         let other = scope.spawn(run);
@@ -278,7 +278,7 @@ fn detections_without_scene_id_are_of_the_only_scene_or_refused() {
     assert!(run.stderr.contains("name no scene_id and are taken for scene 7"), "{}", run.stderr);
     assert_eq!(run.json()["poses"], 1);
 
-    // Of a scene that is not there: the reason is named.
+    // A detection of a scene that does not exist: the reason is stated.
     detection["scene_id"] = 3.into();
     write(&detection);
     let other = ARGUMENTS.replace("results.csv", "other.csv");
@@ -286,7 +286,7 @@ fn detections_without_scene_id_are_of_the_only_scene_or_refused() {
     assert!(run.stderr.contains("none of the 1 detections is of a target"), "{}", run.stderr);
     assert!(run.stderr.contains("scene_id 3, image_id 4, category_id 2"), "{}", run.stderr);
 
-    // With two scenes nobody can know which is meant.
+    // With two scenes it is unclear which one is meant.
     detection.as_object_mut().unwrap().remove("scene_id");
     write(&detection);
     std::fs::create_dir_all(tiny.file("test/000008")).unwrap();

@@ -6,7 +6,7 @@ use serde_json::Value;
 
 use crate::support::*;
 
-/// A few steps on small images: it knows next to nothing, but is whole.
+/// A few steps on small images: the detector learns almost nothing, but is complete.
 const TRAIN: &str = "train detector --dataset tiny --ids 1 --size 96 --batch 2 --out detector";
 const WEIGHTS: &str = "detector/model.safetensors";
 
@@ -32,7 +32,7 @@ fn a_detector_is_trained_and_used() {
     assert!(std::fs::read(tiny.path().join(WEIGHTS)).unwrap() == model);
     fails(tiny.path(), &format!("{TRAIN} --steps 121"), &["steps was 120, is 121", "another folder"]);
 
-    // Going on from weights, whose origin the card keeps.
+    // Continuing from weights; the card states their origin.
     let further = TRAIN.replace("--out detector", &format!("--out further --init {WEIGHTS} --steps 1"));
     sixfold(tiny.path(), &further).expect(0);
     let card = std::fs::read_to_string(tiny.path().join("further/model.md")).unwrap();
@@ -54,7 +54,7 @@ fn a_detector_is_trained_and_used() {
     let coco = json_of(&tiny.path().join("one/detections.json"));
     assert_eq!(coco[0]["segmentation"]["size"], serde_json::json!([HEIGHT, WIDTH]));
     assert_eq!(coco[0]["bbox"], found["bbox"]);
-    // Nobody is that sure.
+    // No detection has this score.
     sixfold(tiny.path(), &detect(&format!("{rgb} --threshold 1"))).expect(1);
 
     // Several files.
@@ -84,7 +84,7 @@ fn a_detector_is_trained_and_used() {
     let json = sixfold(tiny.path(), &format!("{all} --except except.json")).expect(0).json();
     assert_eq!(json["images"], 2);
 
-    // Its masks for ICP and for new views.
+    // Uses its masks for ICP and for new views.
     let pose = format!(
         "estimate --dataset tiny --targets targets.json --out masked.csv --detector {WEIGHTS} --json"
     );
@@ -98,7 +98,7 @@ fn a_detector_is_trained_and_used() {
     let other = views.replace("--ids 1", "--ids 1,2");
     fails(tiny.path(), &format!("{other} --detector {WEIGHTS} --out more"), &["detector", "not object 2"]);
 
-    // Objects it does not know.
+    // Objects that it was not trained on.
     fails(tiny.path(), &detect(&format!("{rgb} --ids 2")), &["--ids", "knows the objects 1", "not object 2"]);
     let estimate = "estimate --dataset tiny --out r.csv --detector detector/model.safetensors";
     fails(tiny.path(), estimate, &["detector", "not object 2"]);
@@ -132,7 +132,7 @@ fn images_of_all_kinds() {
         &format!("detect --weights {encoder} --rgb grey.png"),
         &["architecture", "detect-compact"],
     );
-    // An unreadable image of a dataset costs itself only.
+    // An unreadable image of a dataset affects only itself.
     std::fs::write(path("tiny/test/000007/rgb/000004.png"), b"no image").unwrap();
     let run = sixfold(tiny.path(), &detect("--dataset tiny --threshold 0 --out found.json")).expect(2);
     assert!(run.stderr.contains("skipped image 7/4"), "{}", run.stderr);
@@ -152,7 +152,7 @@ fn a_dataset_with_an_image_left_out_is_completed_by_the_same_command() {
     std::fs::write(&image, b"no image").unwrap();
     let part = sixfold(tiny.path(), &all("found.json")).expect(2).json();
     assert!(part["detections"].as_u64().unwrap() < whole["detections"].as_u64().unwrap(), "{part}");
-    // Not with another threshold, nor with other weights.
+    // Not resumed with another threshold, nor with other weights.
     let other = all("found.json").replace("--threshold 0", "--threshold 0.1");
     fails(tiny.path(), &other, &["found.json.part", "threshold", "remove both"]);
     let other = all("found.json").replace("detector/model", "other/model");
@@ -176,7 +176,7 @@ fn a_dataset_with_an_image_left_out_is_completed_by_the_same_command() {
 fn overlays_that_cannot_be_written_cost_no_detections() {
     let tiny = Tiny::coloured();
     sixfold(tiny.path(), &format!("{TRAIN} --steps 1")).expect(0);
-    // A file where the folder should be: said before anything is computed.
+    // A file in the place of the folder: reported before anything is computed.
     std::fs::write(tiny.path().join("taken"), b"").unwrap();
     let all = "--dataset tiny --threshold 0 --out found.json --json";
     fails(tiny.path(), &detect(&format!("{all} --overlays taken/pictures")), &["taken"]);
@@ -204,7 +204,7 @@ fn weights_of_torchvision_are_a_detector() {
     for (from, to) in [("mask-rcnn.safetensors", "mask.safetensors"), ("faster-rcnn.pth", "faster.pth")] {
         std::fs::copy(fixtures.join(from), path(to)).unwrap();
     }
-    // Networks in miniature want small images.
+    // Miniature networks need small images.
     let sides = r#""min_side": 96, "max_side": 160, "norm_epsilon": 1e-5"#;
     std::fs::write(path("mask.objects.json"), format!(r#"{{"objects": {{"1": 1, "3": 30}}, {sides}}}"#))
         .unwrap();
@@ -243,7 +243,7 @@ fn weights_of_torchvision_are_a_detector() {
     let run = sixfold(tiny.path(), pose);
     assert!(run.code < 2, "{}", run.stderr);
 
-    // What is none.
+    // An invalid file.
     std::fs::write(path("mask.objects.json"), r#"{"objects": {"9": 1}}"#).unwrap();
     fails(
         tiny.path(),
@@ -275,7 +275,7 @@ fn detectors_with_anchors_are_trained_and_used() {
         let found = run.expect(0).json()["detections"].as_array().unwrap().clone();
         assert!(found.iter().all(|d| d["object_id"] == 1), "{found:?}");
         assert!(network != "mask-rcnn" || found.iter().any(|d| d["mask_pixels"].is_u64()), "{found:?}");
-        // From its own weights.
+        // Continuing from its own weights.
         let further =
             of.replace("--out ", &format!("--init {network}/model.safetensors --steps 1 --out more-"));
         sixfold(tiny.path(), &further).expect(0);

@@ -19,7 +19,7 @@ fn ground_truth_scores_one() {
     }
     assert_eq!(json["targets"], 6);
     assert_eq!(json["detection"]["ap"], 1.0);
-    // Ground truth takes no time.
+    // Ground truth has no times.
     let reasons: Vec<&String> = json["reasons"].as_object().unwrap().keys().collect();
     assert_eq!(reasons, ["average_time_per_image"]);
     let curves = image::open(tiny.path().join("curves.png")).unwrap();
@@ -30,7 +30,7 @@ fn ground_truth_scores_one() {
 fn itodd_has_a_delta_of_its_own() {
     let tiny = Tiny::new(true);
     let dir = tiny.path();
-    // Poses 12 mm behind the truth: what of them is visible depends on whether the delta is 5 or 15 mm.
+    // Poses 12 mm behind the truth: their visible part depends on whether delta is 5 or 15 mm.
     tiny.write_truth_as_results("results.csv");
     move_results(dir, 12.0);
     let vsd = |arguments: &str| {
@@ -70,7 +70,7 @@ fn vsd_as_published_is_recall_at_one_tolerance() {
         let run = sixfold(dir, &format!("{ARGUMENTS} --json {options}")).expect(0);
         run.json()
     };
-    // Half of the targets are asked for by the dataset's own file; as published all annotated poses count.
+    // The dataset's own file requests half of the targets; with the published preset all annotated poses count.
     let targets = tiny.file("test_targets_bop19.json");
     let text = std::fs::read_to_string(&targets).unwrap();
     let lines: Vec<&str> = text.lines().filter(|l| l.contains("\"im_id\":0")).collect();
@@ -102,7 +102,7 @@ fn vsd_as_published_is_recall_at_one_tolerance() {
 fn models_of_another_folder_are_scored_with() {
     let tiny = Tiny::new(true);
     tiny.write_truth_as_results("results.csv");
-    // As T-LESS has them: no folder `models`. Object 1 is another shape in models_reconst, and a symmetric one there.
+    // Like T-LESS: no folder `models`. In models_reconst, object 1 has another, symmetric shape.
     std::fs::rename(tiny.file("models"), tiny.file("models_cad")).unwrap();
     fails(
         tiny.path(),
@@ -115,7 +115,7 @@ fn models_of_another_folder_are_scored_with() {
     let model = tiny.file("models_cad/obj_000002.ply");
     std::fs::copy(&model, tiny.file("models_reconst/obj_000001.ply")).unwrap();
     std::fs::copy(&model, tiny.file("models_reconst/obj_000002.ply")).unwrap();
-    // Of other models nothing is known: diameter and symmetries are in the folder's own file.
+    // Diameter and symmetries come from the models folder's own file, so nothing is known of other models.
     let json = sixfold(tiny.path(), &format!("{ARGUMENTS} --models models_reconst --json")).expect(1).json();
     assert!(json["reasons"]["ar"].as_str().unwrap().contains("models_info.json"), "{json}");
 }
@@ -147,7 +147,7 @@ fn a_wrong_pose_lowers_the_scores_of_its_object_only() {
     tiny.write_truth_as_results("results.csv");
     let file = tiny.path().join("results.csv");
     let text = std::fs::read_to_string(&file).unwrap();
-    // One of object 2's three rows is taken out.
+    // One of object 2's three rows is removed.
     let kept: Vec<&str> = text.lines().filter(|l| !l.starts_with("7,4,2,")).collect();
     std::fs::write(&file, kept.join("\n") + "\n").unwrap();
     let json = sixfold(tiny.path(), &format!("{ARGUMENTS} --json scores.json")).expect(0);
@@ -215,8 +215,8 @@ fn curves_that_cannot_be_plotted_cost_no_scores() {
     assert!(run.stderr.contains("skipped taken/curves.png"), "{}", run.stderr);
 }
 
-/// Many rows stand for hours of scoring. How long they take depends on the machine: the first of several moments that is in the
-/// middle of the work counts.
+/// Many rows, to simulate hours of scoring. The duration depends on the machine, so the first of several moments that falls
+/// into the work is used.
 #[cfg(unix)]
 #[test]
 fn an_interrupt_ends_it_at_once() {
@@ -252,7 +252,7 @@ fn an_interrupt_ends_it_at_once() {
             std::thread::sleep(Duration::from_millis(20));
         }
         let output = run.wait_with_output().unwrap();
-        // It was done a moment before, or had not yet begun.
+        // It had just finished, or had not started yet.
         if output.status.code() != Some(2) {
             continue;
         }

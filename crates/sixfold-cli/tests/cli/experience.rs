@@ -11,7 +11,7 @@ use crate::support::*;
 
 const VIEW: &str = "grasp propose --depth depth.png --camera camera.json --mask mask.png";
 
-/// An object on a table, and a network that has learned next to nothing: what is stored and found does not depend on it.
+/// An object on a table, and a hardly trained network: the stored and found grasps do not depend on it.
 fn folder() -> OneImage {
     let case = OneImage::new();
     let alone = render_depth(&part(), &case.truth, &camera());
@@ -54,7 +54,7 @@ fn experience_is_stored_shown_used_merged_exported_and_forgotten() {
     let grasps = handle["grasps"].as_array().unwrap();
     let kinds = ["geometry", "experience"];
     assert!(grasps.iter().all(|g| kinds.contains(&g["experience"]["kind"].as_str().unwrap())));
-    // The transferred one, or one of the planner's within 5 cm and 15 degrees of it.
+    // The transferred grasp, or one of the planner's within 5 cm and 15 degrees of it.
     assert!(grasps.iter().any(|g| share(g) > 0.0), "what was stored is among them: {handle}");
     let lid = sixfold(path, &format!("{part} lid")).expect(1);
     assert!(lid.stderr.contains("no experience on a part named lid"), "{}", lid.stderr);
@@ -86,16 +86,16 @@ fn a_hand_learns_and_goes_on() {
     let held = first["held"].as_i64().unwrap();
     assert!(held >= 1);
     assert_eq!(first["experiences"].as_i64(), Some(held));
-    // What failed is known as well, and what is tried besides.
+    // Failed grasps are recorded too, and so are additional trials.
     assert!(first["outcomes"].as_i64().unwrap() >= 3, "{first}");
     let explore = "grasp learn --experiences more.db --object part.ply --unit mm --attempts 1 --explore 3 --near 0 --seed 5 --weights w.safetensors --out more --json";
     let more = sixfold(path, explore).json();
     assert!((2..=4).contains(&more["outcomes"].as_i64().unwrap()), "{more}");
     let merged = sixfold(path, "grasp store merge all.db e.db more.db --json").expect(0).json();
     assert_eq!(merged["experiences"].as_i64().unwrap(), held + more["experiences"].as_i64().unwrap());
-    // From the second success on there is experience, and near is far enough for all of it.
+    // From the second success on there is experience, and the distance limit is large enough for all of it.
     assert!(first["from_experience"].as_i64().unwrap() >= 1, "{first}");
-    // Nothing is left to do; a line that was cut off is done again.
+    // Nothing is left to do; a truncated line is done again.
     let journal = path.join("learn/attempts.jsonl");
     let text = fs::read_to_string(&journal).unwrap();
     fs::write(&journal, &text[..text.len() - 20]).unwrap();
@@ -124,11 +124,11 @@ fn a_journal_without_its_store_is_refused() {
     }
     fails(path, &learn, &["attempts.jsonl", "holds 2 scenes", "e.db has 0", "another store", "--out"]);
     assert!(!path.join("e.db").exists(), "what is refused makes no store");
-    // Another store in its place.
+    // Another store at its place.
     let another = learn.replace("--out learn", "--out other").replace("--attempts 2", "--attempts 1");
     sixfold(path, &another);
     fails(path, &learn, &["attempts.jsonl", "holds 2 scenes", "e.db has 0"]);
-    // Its own comes back.
+    // Its own store is put back.
     for name in ["e.db", "e.db-wal", "e.db-shm"] {
         let _ = fs::remove_file(path.join(name));
         let _ = fs::rename(path.join(format!("kept-{name}")), path.join(name));
@@ -147,7 +147,7 @@ fn a_hand_that_is_killed_ends_as_if_nothing_had_happened() {
     for kill in 0..kills {
         let (store, out) = (format!("e{kill}.db"), format!("learn{kill}"));
         let learn = LEARN.replace("e.db", &store).replace("--out learn", &format!("--out {out}"));
-        // Two kills each, all over the time that it takes.
+        // Two kills in each round, spread over the duration of the command.
         for part in [f64::from(kill) + 0.4, f64::from(kills - kill) + 0.7] {
             let mut hand = std::process::Command::new(crate::PROGRAM)
                 .args(learn.split_whitespace())
@@ -211,7 +211,7 @@ fn a_gripper_under_a_centimetre_is_no_panic() {
     }
 }
 
-/// Overwrites the first byte of some that are found in a file.
+/// Overwrites the first byte of a byte sequence in a file.
 fn overwrite(file: &Path, bytes: &[u8]) {
     let mut content = fs::read(file).unwrap();
     let place = content.windows(bytes.len()).position(|found| found == bytes).unwrap();
@@ -298,7 +298,7 @@ fn an_address_that_is_none_is_refused_without_its_password() {
             let run = sixfold(path, &command).expect(2);
             assert!(!run.stderr.contains("secret"), "{}", run.stderr);
         }
-        // A server that is only away is learned without.
+        // With an unreachable server, learning continues without it.
         if !(cfg!(feature = "postgres") && address.starts_with("Postgres")) {
             let run = sixfold(path, &learn).expect(2);
             assert!(!run.stderr.contains("secret"), "{}", run.stderr);
@@ -343,7 +343,7 @@ fn what_is_wrong_is_named() {
     fails(path, "train dgcm --views 3 --out x", &["--views", "64"]);
 }
 
-/// Nobody listens there, and nobody may read the password.
+/// No server listens there, and the password must not be printed.
 const ADDRESS: &str = "postgres://robot:secret@127.0.0.1:1/fleet";
 
 #[test]
@@ -352,7 +352,7 @@ fn a_server_that_cannot_be_had_is_named_without_its_password() {
     let path = case.path();
     sixfold(path, &format!("{VIEW} --out out")).expect(0);
     add(path, "a.db", "").expect(0);
-    // A build of the whole workspace may have the feature without the program's own name for it.
+    // A build of the whole workspace may enable the feature without the program's own feature flag.
     let words = ["server of the experience store cannot be reached", "--features postgres"];
     let expected = &words[..if cfg!(feature = "postgres") { 1 } else { 2 }];
     for command in [
@@ -388,7 +388,7 @@ fn a_hand_learns_while_the_server_is_away() {
     assert!(!journal.contains("secret") && !run.stderr.contains("secret") && !run.stdout.contains("secret"));
     let listed = sixfold(path, "grasp store list learn/outbox.db --json").expect(0).json();
     assert_eq!(listed.as_array().unwrap().len() as i64, held);
-    // The outbox may lie elsewhere; what is wrong with it is told.
+    // The outbox may be elsewhere; errors in it are reported.
     fs::write(path.join("text.db"), "not a database, but long enough to look like one to somebody").unwrap();
     fails(
         path,

@@ -1,4 +1,4 @@
-//! The commands that another program runs: `sixfold reproduce`, `sixfold grasp compare`, `sixfold grasp measure`.
+//! Commands that another program runs: `sixfold reproduce`, `sixfold grasp compare`, `sixfold grasp measure`.
 
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
@@ -9,7 +9,7 @@ use crate::support::Run;
 
 const OTHER: &str = "sixfold-experiments";
 
-/// Runs a copy of the program that lies alone in `folder`, with `path` as PATH.
+/// Runs a copy of the program that is alone in `folder`, with `path` as PATH.
 fn run(folder: &Path, path: &str, arguments: &str) -> Run {
     let program = folder.join("sixfold");
     if !program.exists() && fs::hard_link(crate::PROGRAM, &program).is_err() {
@@ -23,7 +23,7 @@ fn run(folder: &Path, path: &str, arguments: &str) -> Run {
     }
 }
 
-/// A program in place of the other one, which says what it is told.
+/// A stand-in for the other program, which prints its arguments.
 fn other(folder: &Path) -> PathBuf {
     let file = folder.join(OTHER);
     fs::write(&file, "#!/bin/sh\necho \"told: $*\"\nexit 7\n").unwrap();
@@ -48,7 +48,7 @@ fn the_other_program_is_run_from_beside_or_from_the_path() {
         let found = run(alone.path(), &path, command).expect(7);
         assert_eq!(found.stdout, format!("told: {command}\n"));
     }
-    // Beside goes first.
+    // The program beside it comes first.
     let file = other(alone.path());
     fs::write(&file, "#!/bin/sh\nexit 5\n").unwrap();
     run(alone.path(), &path, COMMANDS[0]).expect(5);

@@ -1,4 +1,4 @@
-//! What commands write does not replace what others wrote, and what is in a folder belongs together.
+//! Commands do not replace files of others, and the files in a folder belong together.
 
 use std::path::Path;
 
@@ -16,7 +16,7 @@ fn read(dir: &Path, name: &str) -> Vec<u8> {
     std::fs::read(dir.join(name)).unwrap()
 }
 
-/// Seen: images stayed, models were replaced by those of the changed mesh, and all ground truth was wrong.
+/// Once, images stayed while models were replaced by those of the changed mesh, and all ground truth was wrong.
 #[test]
 #[cfg(feature = "physics")]
 fn simulate_scenes_does_not_resume_with_a_changed_mesh_at_the_same_path() {
@@ -30,7 +30,7 @@ fn simulate_scenes_does_not_resume_with_a_changed_mesh_at_the_same_path() {
     std::fs::remove_file(dir.join("new/test/000001/scene_gt_info.json")).unwrap();
     fails(dir, SCENES, &["options.json", "other contents of object 1", "--out"]);
     assert!(models() == before);
-    // So it is with another camera, and with a model that somebody changed.
+    // The same with another camera, and with a model that was changed.
     std::fs::write(dir.join("part.ply"), mesh).unwrap();
     let camera = std::fs::read_to_string(dir.join("camera.json")).unwrap();
     replace(&dir.join("camera.json"), "300.0", "310.0");
@@ -39,12 +39,12 @@ fn simulate_scenes_does_not_resume_with_a_changed_mesh_at_the_same_path() {
     truncate(&dir.join("new/models/obj_000001.ply"), 0.9);
     fails(dir, SCENES, &["obj_000001.ply", "changed"]);
     std::fs::write(dir.join("new/models/obj_000001.ply"), &before[0]).unwrap();
-    // With what it was begun with it resumes.
+    // With its original inputs it is resumed.
     assert_eq!(sixfold(dir, &format!("{SCENES} --json")).expect(0).json()["new_scenes"], 1);
     assert!(models() == before);
 }
 
-/// Seen: `--dataset own --out own` cut models_info.json from 8 objects to 1.
+/// `--dataset own --out own` once reduced models_info.json from 8 objects to 1.
 #[test]
 #[cfg(feature = "networks")]
 fn synthesize_does_not_write_over_its_input_or_another_dataset() {
@@ -65,7 +65,7 @@ fn synthesize_does_not_write_over_its_input_or_another_dataset() {
     assert_eq!(read(dir, "there/models/models_info.json"), b"{}");
     assert_eq!(read(dir, "tiny/models/models_info.json"), before);
 
-    // Its own folder is resumed, but not when a photograph is another one at the same path.
+    // Its own folder is resumed, but not if a photograph was replaced at the same path.
     sixfold(dir, &format!("{run} --out new")).expect(0);
     sixfold(dir, &format!("{run} --out new")).expect(0);
     let images = tiny.file("test/000007/rgb");
@@ -89,7 +89,7 @@ fn the_second_of_two_at_once_is_refused_at_once() {
     assert!(!dir.join("new").exists());
 }
 
-/// Seen: `render --out .` replaced the depth image that a user had taken.
+/// `render --out .` once replaced a user's depth image.
 #[test]
 fn images_of_the_user_are_not_replaced() {
     let one = OneImage::new();
@@ -98,7 +98,7 @@ fn images_of_the_user_are_not_replaced() {
     let render = "render --object part.ply --unit mm --out";
     fails(dir, &format!("{render} ."), &["depth.png", "not written by this program"]);
     assert!(["depth.png", "rgb.png"].map(|name| read(dir, name)) == before && !dir.join("mask.png").exists());
-    // Its own images are.
+    // Its own images are replaced.
     for _ in 0..2 {
         sixfold(dir, &format!("{render} out")).expect(0);
     }
@@ -143,7 +143,8 @@ fn counts_out_of_range_and_ids_named_twice_are_refused() {
     }
 }
 
-/// Seen: the diameter times 1000 gave recall 1.0 for a wrong pose, an axis of 1e308 too; 1000 x 200 symmetries never ended.
+/// Once, the diameter times 1000 gave recall 1.0 for a wrong pose, as did an axis of 1e308; 1000 x 200 symmetries never
+/// ended.
 #[test]
 fn a_models_info_that_is_not_of_the_meshes_is_refused() {
     let axis = r#"{"axis": [0, 0, 1e308], "offset": [0, 0, 0]}"#;

@@ -1,5 +1,5 @@
-//! The datasets of the dissertation's tables that are not here: small sets in exactly their format, through the commands of
-//! docs/published.md.
+//! Small datasets in exactly the formats of the dissertation's datasets that are not available here, run through the
+//! commands of docs/published.md.
 
 use std::path::Path;
 
@@ -31,7 +31,7 @@ fn assert_found(dataset: &Path, split: &str, results: &Path) {
     assert_eq!(count, 6);
 }
 
-/// T-LESS as BOP has it: `test_primesense`, CAD and reconstructed models, and no folder `models`.
+/// T-LESS in BOP's form: `test_primesense`, CAD and reconstructed models, and no folder `models`.
 fn tless() -> Tiny {
     let tiny = Tiny::coloured();
     std::fs::rename(tiny.file("models"), tiny.file("models_cad")).unwrap();
@@ -66,7 +66,7 @@ fn tless_with_either_kind_of_models() {
     };
     assert_eq!(estimate("models_cad")["ar_vsd"], 1.0);
     assert_found(&tiny.path().join("tiny"), "test_primesense", &dir.join("models_cad.csv"));
-    // The other models are others: the same run is not resumed with them, and their poses differ.
+    // The run is not resumed with other models, and their poses differ.
     let same = format!("estimate {TLESS} --models models_reconst --targets all --out models_cad.csv");
     fails(dir, &same, &["models_cad.csv", "other options"]);
     estimate("models_reconst");
@@ -108,7 +108,7 @@ fn tless_networks_learn_from_cad_models() {
          --targets all --ids 1 --boxes gt --out pix2pose.csv"
     );
     let status = sixfold(dir, &estimate);
-    // One step teaches nothing: that something is found is not asked for, only that it runs.
+    // One training step is not enough to find anything: only check that it runs.
     assert!(matches!(status.code, 0 | 1), "{}", status.stderr);
 }
 
@@ -165,7 +165,7 @@ fn smot_is_converted_searched_and_scored() {
     fails(dir, "import smot SMOT --out other", &["train", "missing"]);
 }
 
-/// A dictionary as Python 2 pickled it in its first protocol, with arrays of 64 bit numbers.
+/// A dictionary as Python 2 pickles it with its first protocol, with arrays of 64 bit numbers.
 fn pickled(name: &str, arrays: &[(&str, &[usize], Vec<f64>)]) -> String {
     let mut text = format!("(dp0\nS'objName'\np1\nS'{name}'\np2\ns");
     for (key, shape, values) in arrays {

@@ -1,4 +1,5 @@
-//! Meshes that name files they should not, or are no object at all, and two who change one stored object at once.
+//! Meshes that refer to forbidden files, degenerate meshes, and two processes that change one stored object at
+//! once.
 
 use std::path::Path;
 use std::process::Command;
@@ -51,7 +52,7 @@ fn xyz(vertices: &[[f64; 3]], _: &[[u32; 3]]) -> String {
 type Writer = fn(&[[f64; 3]], &[[u32; 3]]) -> String;
 const FORMATS: [(&str, Writer); 4] = [("ply", ply), ("obj", obj), ("stl", stl), ("xyz", xyz)];
 
-/// A name, vertices, faces, and what the message has to say; nothing where a result is as good.
+/// A name, vertices, faces, and words of the message; none if a result is acceptable too.
 type Degenerate = (&'static str, Vec<[f64; 3]>, Vec<[u32; 3]>, &'static [&'static str]);
 
 fn degenerate() -> Vec<Degenerate> {
@@ -94,7 +95,8 @@ fn objects_without_a_shape_are_a_message_or_a_result_at_once_in_every_format() {
                 let start = Instant::now();
                 let run = sixfold(dir, &command.replace("MESH", &file));
                 let took = start.elapsed();
-                // A debug build on a busy machine; released, each takes less than two seconds.
+                // The limit is for a debug build on a loaded machine; in a release build each takes less than two
+                // seconds.
                 assert!(took < Duration::from_secs(60), "{command} {file}: {took:?}");
                 assert!((0..=2).contains(&run.code), "{command} {file}: {run:?}");
                 if !words.is_empty() && ending != "xyz" {
@@ -185,7 +187,7 @@ fn an_object_survives_two_who_replace_it_at_once_and_kills_at_any_moment() {
     for round in 0..12u64 {
         let mut both = [start(dir, add), start(dir, add)];
         std::thread::sleep(Duration::from_millis(40 * round));
-        // Every second round one of them dies.
+        // In every second round one of them is killed.
         if round % 2 == 0 {
             let _ = both[0].kill();
         }

@@ -4,7 +4,7 @@ use serde_json::Value;
 
 use crate::support::*;
 
-/// JSON without what a clock measured.
+/// JSON without measured times.
 fn without_times(mut value: Value) -> Value {
     for pose in value["poses"].as_array_mut().unwrap() {
         assert!(pose.as_object_mut().unwrap().remove("seconds").is_some());
@@ -28,7 +28,7 @@ fn finds_the_pose_and_draws_it() {
         serde_json::from_slice(&std::fs::read(case.path().join("out/poses.json")).unwrap()).unwrap();
     assert_eq!(kept, json);
 
-    // The overlay colours the object where it stands and leaves the rest of the image alone.
+    // The overlay colours the object's pixels and leaves the rest of the image unchanged.
     let overlay = image::open(case.path().join("out/overlay.png")).unwrap().to_rgb8();
     assert_eq!(overlay.dimensions(), (WIDTH as u32, HEIGHT as u32));
     let middle = camera().project(&case.truth.transform_point(&part().vertices()[0])).unwrap();
@@ -39,7 +39,7 @@ fn finds_the_pose_and_draws_it() {
         .collect();
     assert!(changed.len() > 1000, "{} pixels drawn", changed.len());
     assert!(changed.iter().all(|(x, y)| (x - middle.x).hypot(y - middle.y) < 120.0));
-    // The description was kept in the cache, and nothing beside the mesh.
+    // The description was stored in the cache, and nothing beside the mesh.
     assert!(cached(case.path(), "ppf.bin").is_file());
     let mut beside: Vec<_> = std::fs::read_dir(case.path())
         .unwrap()
@@ -129,7 +129,7 @@ fn two_instances_and_boxes() {
     both.sort_by(|a, b| a.translation().x.total_cmp(&b.translation().x));
     assert_near(&both[0], &poses[0]);
     assert_near(&both[1], &poses[1]);
-    // A box or a mask says which of the two.
+    // A box or a mask selects one of the two.
     let left = found("--box -10,40,160,150");
     assert_eq!(left.len(), 1);
     assert_near(&left[0], &poses[0]);

@@ -42,5 +42,5 @@ mod trainings;
 #[cfg(not(feature = "networks"))]
 mod without_networks;
 
-/// What is tested.
+/// The program under test.
 const PROGRAM: &str = env!("CARGO_BIN_EXE_sixfold");

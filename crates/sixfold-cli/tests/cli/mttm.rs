@@ -58,7 +58,8 @@ fn an_object_is_stored_with_templates_and_found() {
     assert_eq!(std::fs::read(dir.join("sixfold-objects/twin/templates.bin")).unwrap(), bytes);
     fails(dir, "object add thing part.ply --unit mm --templates", &["thing", "--replace"]);
     assert_eq!(std::fs::read(&file).unwrap(), bytes);
-    // Other sides for one search are kept beside, and leave the object's own templates as they are.
+    // Templates from other directions for one search are stored separately and leave the object's own
+    // templates unchanged.
     let around = format!("{DEPTH} --matcher points --object thing --templates around --json");
     let found = sixfold(dir, &around).expect(0).json();
     assert_near(&pose_of(&found["poses"][0]["camera_from_object"]), &case.truth);
@@ -80,21 +81,21 @@ fn an_object_seen_once_in_depth_is_found_in_another_place() {
     sixfold(dir, "object add seen-too --depth depth.png --mask mask.png --camera camera.json").expect(0);
     let shown = sixfold(dir, "object show seen --json").expect(0).json();
     assert_eq!(shown["without_mesh"], true);
-    // Pushed 4 cm along the table and turned a little.
+    // Moved by 4 cm along the table and rotated a little.
     let moved = case.truth * Pose::exp(&[0.03, 0.02, 0.0, 0.0, 0.0, 0.15].into());
     write_depth(&dir.join("moved.png"), &depth_of(&[(&part(), moved)]), DEPTH_SCALE).unwrap();
     let found = "estimate --method mttm --depth moved.png --camera camera.json --json --out out";
     let run = sixfold(dir, &format!("{found} --object seen")).expect(0).json();
     assert_eq!(run["poses"][0]["frame"], "object");
     assert_near(&pose_of(&run["poses"][0]["camera_from_object"]), &moved);
-    // Without a pose the view's own frame is what moves.
+    // Without a pose, the result is the motion of the view's own frame.
     let run = sixfold(dir, &format!("{found} --object seen-too")).expect(0).json();
     assert_eq!(run["poses"][0]["frame"], "view");
     let still = sixfold(dir, &format!("{DEPTH} --json --object seen-too")).expect(0).json();
     let (there, here) =
         (pose_of(&run["poses"][0]["camera_from_object"]), pose_of(&still["poses"][0]["camera_from_object"]));
     assert_near(&(there * here.inverse() * case.truth), &moved);
-    // auto asks this method alone, and calls no confidence a probability.
+    // auto uses only this method, and does not report its confidence as a probability.
     let auto = "estimate --method auto --depth moved.png --camera camera.json --json --object seen";
     let answer = sixfold(dir, auto).expect(0);
     let pose = &answer.json()["poses"][0];
@@ -106,7 +107,7 @@ fn an_object_seen_once_in_depth_is_found_in_another_place() {
         "{}",
         answer.stderr
     );
-    // Others cannot look for it.
+    // Other methods cannot search for it.
     let other = "estimate --method ppf --depth depth.png --camera camera.json --object seen";
     fails(dir, other, &["seen", "no mesh", "mttm"]);
 }
@@ -115,13 +116,13 @@ fn an_object_seen_once_in_depth_is_found_in_another_place() {
 fn templates_from_around_find_what_lies_upside_down() {
     let case = OneImage::new();
     let dir = case.path();
-    // On its tower, the bottom up.
+    // Upside down, on its tower.
     let truth = on_table(0.02, 0.01, 0.5) * Pose::exp(&[0.0, 0.0, 0.11, 0.0, 0.0, 0.0].into());
     let truth = truth * Pose::exp(&[0.0, 0.0, 0.0, std::f64::consts::PI, 0.0, 0.0].into());
     write_depth(&dir.join("over.png"), &depth_of(&[(&part(), truth)]), DEPTH_SCALE).unwrap();
     let search =
         "estimate --method mttm --depth over.png --camera camera.json --object part.ply --unit mm --json";
-    // With what the cache of each keeps, and whichever was searched with first.
+    // With the cached data of each, and in either order of searches.
     for _ in 0..2 {
         let above = sixfold(dir, search);
         assert!(above.code < 2, "{}", above.stderr);
@@ -156,7 +157,7 @@ fn a_mask_cut_too_large_is_trimmed_or_refused() {
     }
     let out = &trimmed.json()["left_out"][0];
     assert!(out["mask"] == "large.png" && out["on_plane"].as_f64().unwrap() > 0.1, "{out}");
-    // What is refused leaves nothing, and can be asked for all the same.
+    // A refused object leaves no files, and the same name can be added again.
     let refused = add("refused", "huge.png").expect(2);
     for words in ["huge.png", "% of the mask", "plane", "cut it closer", "--mask-as-is"] {
         assert!(refused.stderr.contains(words), "{}", refused.stderr);
@@ -195,7 +196,7 @@ fn bad_templates_and_bad_depth_are_explained() {
         "object add x --depth depth.png --mask mask.png --camera camera.json --depth-scale 100",
         &["depth.png", "m large", "depth scale"],
     );
-    // Nothing half-made is left.
+    // No incomplete object is left.
     sixfold(dir, "object list").expect(1);
     fails(dir, &format!("{DEPTH} --object part.ply --unit mm --depth-scale 0.0001"), &["depth.png", "1000"]);
     fails(dir, &format!("{DEPTH} --object part.ply --unit mm --icp"), &["--icp", "pix2pose"]);

@@ -21,7 +21,7 @@ fn objects_are_added_listed_shown_used_and_removed() {
     let picture = image::open(dir.join("part.png")).unwrap().to_rgb8();
     assert!(picture.pixels().any(|p| p.0 != [255; 3]));
 
-    // The store knows the unit, so estimate and render need the name only.
+    // The store contains the unit, so estimate and render need only the name.
     let run =
         sixfold(dir, "estimate --depth depth.png --camera camera.json --object my-part --json").expect(0);
     assert_eq!(run.json()["poses"][0]["object"], "my-part");
@@ -36,7 +36,7 @@ fn objects_are_added_listed_shown_used_and_removed() {
     fails(dir, "object show my-part", &["my-part", "none yet", "sixfold object add"]);
     fails(dir, "object remove my-part", &["my-part"]);
     sixfold(dir, "object list").expect(1);
-    // Nothing of it stays behind, no half-written folder either.
+    // Nothing of it remains, not even an incomplete folder.
     assert_eq!(std::fs::read_dir(dir.join("sixfold-objects")).unwrap().count(), 0);
 }
 
@@ -96,13 +96,13 @@ fn symmetries_are_found_shown_and_stored() {
     let found = json.as_array().unwrap();
     assert_eq!(found.len(), 3, "{json:#}");
     assert!(found.iter().all(|s| s["order"] == 2 && s["by_shape"] == "sure"));
-    // The red side lies below: half turns about z keep it there.
+    // The red side is at the bottom: half turns about z keep it there.
     let kept: Vec<_> = found.iter().filter(|s| s["by_shape_and_color"] == "sure").collect();
     assert!(kept.len() == 1 && kept[0]["axis"][2].as_f64().unwrap() > 0.999, "{json:#}");
     assert_eq!(kept[0]["poses"][0][2][2].as_f64().unwrap().round(), 1.0);
     let sheet = image::open(dir.join("box.png")).unwrap().to_rgb8();
     assert_eq!(sheet.width() % 4, 0);
-    // Four images: as it is, and after each half turn; each shows the object.
+    // Four images: the object unchanged, and after each half turn.
     for i in 0..4 {
         let tile =
             image::imageops::crop_imm(&sheet, i * sheet.width() / 4, 40, sheet.width() / 4, 440).to_image();
@@ -125,7 +125,7 @@ fn symmetries_are_found_shown_and_stored() {
     // By its name, as stored.
     assert_eq!(sixfold(dir, "object symmetries box --json").expect(0).json().as_array().unwrap().len(), 3);
 
-    // What has none.
+    // An object without symmetries.
     assert_eq!(
         sixfold(dir, "object symmetries part.ply --unit mm --json").expect(1).json(),
         serde_json::json!([])
@@ -143,7 +143,7 @@ fn symmetries_are_not_found_twice() {
     fails(dir, "object symmetries box.ply --unit mm --noise 50", &["--noise", "50", "0 to 0.02 m"]);
     fails(dir, "object add box box.ply --unit mm --find-symmetries --turns-about z", &["--turns-about"]);
     fails(dir, "object add box box.ply --unit mm --noise 1", &["--find-symmetries"]);
-    // An entry that gives symmetries decides alone; one that gives none leaves room.
+    // An entry with symmetries excludes other options; an entry without symmetries allows them.
     let info = tiny.file("models/models_info.json");
     let add = "object add box box.ply --unit mm --find-symmetries shape --model-id 2 --models-info \
                tiny/models/models_info.json --replace";
@@ -173,7 +173,7 @@ fn render_writes_what_is_seen() {
         let picture = image::open(dir.join("seen").join(name)).unwrap();
         assert_eq!((picture.width(), picture.height()), (WIDTH as u32, HEIGHT as u32), "{name}");
     }
-    // The mask covers exactly where the library sees the object, and its depth is the same.
+    // The mask covers exactly the pixels of the library's rendering, and its depth is the same.
     let expected = sixfold_render::render_depth(&part(), &case.truth, &camera());
     let found = sixfold_io::read_depth(&dir.join("seen/depth.png"), 1e-4).unwrap();
     let mask = sixfold_io::read_mask(&dir.join("seen/mask.png")).unwrap();
@@ -186,7 +186,7 @@ fn render_writes_what_is_seen() {
     }
     assert_eq!(json["pixels"], pixels);
 
-    // Behind the camera there is nothing to see.
+    // Behind the camera nothing is visible.
     sixfold(dir, "render --object part.ply --unit mm --pose 0,0,-0.5,0,0,0 --out behind").expect(1);
     fails(dir, "render --object part.ply --unit mm --pose 0,0,1", &["--pose", "3 numbers"]);
     let mirrored = "-1,0,0,0,0,1,0,0,0,0,1,0.5,0,0,0,1";
@@ -210,7 +210,7 @@ fn commands(help: &str) -> Vec<String> {
         .skip_while(|l| *l != "Commands:")
         .skip(1)
         .take_while(|l| !l.is_empty())
-        // A name stands two columns in; a wrapped description further right.
+        // Names are indented by two columns, wrapped descriptions by more.
         .filter_map(|l| l.strip_prefix("  ").filter(|l| !l.starts_with(' '))?.split_whitespace().next())
         .filter(|name| *name != "help")
         .map(str::to_owned)

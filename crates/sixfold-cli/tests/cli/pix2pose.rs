@@ -9,7 +9,7 @@ use sixfold_pix2pose::model::Pix2PoseModel;
 
 use crate::support::*;
 
-/// Trains object 1 on the three images of the tiny dataset, a small network for so many steps.
+/// Trains a small network on object 1 for a number of steps, on the three images of the tiny dataset.
 fn train(steps: usize) -> String {
     format!(
         "train pix2pose --dataset tiny --ids 1 --size 64 --per-object 4 --rotation 0 --render-share 0 --steps {steps} --out trained"
@@ -51,7 +51,7 @@ fn a_network_trained_on_three_pictures_finds_the_object_in_them() {
     let card = std::fs::read_to_string(tiny.path().join("trained/model.md")).unwrap();
     assert!(card.contains("7/0 7/4 7/11"), "{card}");
 
-    // Without a further step: the same weights, the alignment measured once more with the same result.
+    // Without further steps: the same weights, and the alignment measured again with the same result.
     let again = train(0).replace("--out trained", &format!("--init {WEIGHTS} --out again"));
     sixfold(tiny.path(), &again).expect(0);
     let both = [WEIGHTS, "again/model.safetensors"]
@@ -96,17 +96,17 @@ fn a_network_trained_on_three_pictures_finds_the_object_in_them() {
     );
     assert!(json["poses"][0]["icp"]["inliers"].as_u64().unwrap() > 20);
 
-    // Without the mesh there is a pose all the same.
+    // A pose is found without the mesh too.
     let bare = one_image(&tiny).replace("--object tiny/models/obj_000001.ply --unit mm", "");
     let run = sixfold(tiny.path(), &format!("{bare} --out bare --json")).expect(0);
     assert!(run.stderr.contains("without --object"), "{}", run.stderr);
     assert_eq!(run.json()["poses"][0]["refined"], false);
 
-    // A score nobody reaches: nothing found.
+    // A score that no pose reaches: nothing found.
     let run = sixfold(tiny.path(), &format!("{} --min-score 1.01 --json", one_image(&tiny))).expect(1);
     assert_eq!(run.json()["not_found"][0], "obj_000001");
 
-    // The whole dataset, for the object that the model knows.
+    // The whole dataset, for the model's object.
     let targets = serde_json::json!(
         [0, 4, 11].map(|im| serde_json::json!({"scene_id": 7, "im_id": im, "obj_id": 1, "inst_count": 1}))
     );
@@ -119,7 +119,7 @@ fn a_network_trained_on_three_pictures_finds_the_object_in_them() {
     assert_eq!(json["targets"], 3);
     let results = read_results(&tiny.path().join("results.csv")).unwrap();
     assert!(results.iter().any(|r| r.camera_from_object.distance_to(&tiny.truth_of(r.im_id, 1)) < 0.06));
-    // Other options are another run.
+    // A run with other options is not mixed with this one.
     fails(tiny.path(), &format!("{dataset} --boxes gt --no-refine"), &["results.csv", "other options"]);
 }
 
@@ -145,13 +145,13 @@ fn a_training_goes_on_and_is_not_mixed_with_another() {
         bytes[8 + header..].to_vec()
     };
     assert!(weights("trained") == weights("elsewhere"), "one thread gave other weights than two");
-    // Other options need another folder, and leave what is there alone.
+    // Other options need another folder, and do not change the existing one.
     fails(tiny.path(), &train(6), &["trained", "steps was 3, is 6", "another folder"]);
     fails(tiny.path(), &format!("{} --seed 1", train(3)), &["trained", "seed was 0, is 1"]);
     assert!(std::fs::read(tiny.path().join(WEIGHTS)).unwrap() == model);
     let json = sixfold(tiny.path(), &format!("{} --export --json", train(3))).expect(0).json();
     assert_eq!((&json["steps"], &json["seconds"]), (&3.into(), &Value::Null));
-    // The card states what the network has not seen the mesh of.
+    // The card states that the network was trained without the exact mesh.
     sixfold(tiny.path(), &train(1).replace("--out trained", "--out hull --convex-hull")).expect(0);
     let card = std::fs::read_to_string(tiny.path().join("hull/model.md")).unwrap();
     assert!(card.contains("convex hulls"), "{card}");
@@ -199,7 +199,7 @@ fn a_preset_brings_its_thresholds_and_symmetries() {
     assert_eq!(lmo.objects()[0].thresholds, [0.2]);
     assert!(lmo.card().data.contains("parameters for lmo"), "{}", lmo.card().data);
     assert!(!quiet.contains("appendix A"), "{quiet}");
-    // Object 1 of T-LESS turns about z as it likes; this one, which is no cylinder, does not.
+    // Object 1 of T-LESS is symmetric about z; this one, which is not a cylinder, is not.
     let (tless, told) = model("tless");
     assert_eq!(tless.objects()[0].thresholds, [0.1]);
     assert!(
@@ -223,7 +223,7 @@ fn a_symmetry_that_the_mesh_does_not_have_is_reported() {
     infos.write(&file).unwrap();
     let run = sixfold(tiny.path(), &train(1).replace("--out trained", "--out other")).expect(0);
     let line = run.stderr.lines().find(|l| l.starts_with("warning")).unwrap();
-    // Lying down where it stood, the part of 11 cm is several centimetres away from itself.
+    // Lying instead of standing, the part of 11 cm differs from itself by several centimetres.
     let millimetres: f64 = line
         .split_whitespace()
         .zip(line.split_whitespace().skip(1))
@@ -286,7 +286,7 @@ fn bad_boxes_weights_and_objects() {
     sixfold_io::write_rgb(&tiny.path().join("small.png"), &small).unwrap();
     fails(tiny.path(), &boxed.replace("tiny/test/000007/rgb/000004.png", "small.png"), &["160", "120"]);
     assert!(camera["fx"].is_number());
-    // A dataset's target that the model does not know.
+    // A target of the dataset that the model was not trained on.
     let all =
         format!("estimate --method pix2pose --weights {WEIGHTS} --dataset tiny --boxes gt --out results.csv");
     fails(tiny.path(), &all, &["knows the objects 1", "object 2"]);

@@ -1,4 +1,4 @@
-//! What reaches the screen and what does not: errors as JSON, screens that cannot be written, texts with control characters.
+//! Output to the screen: errors as JSON, a standard output that cannot be written, texts with control characters.
 
 use sixfold_mesh::{PlyFormat, Unit, write_ply};
 
@@ -24,7 +24,7 @@ fn errors_are_json_where_json_was_asked_for() {
         assert!(!message.is_empty() && !message.contains("Usage:"), "{arguments}: {message}");
     }
 
-    // Otherwise errors leave standard output alone.
+    // Otherwise errors print nothing to standard output.
     for arguments in [eval.to_owned(), format!("{eval} --json out.json"), "eval --nonsense".into()] {
         assert_eq!(sixfold(dir.path(), &arguments).expect(2).stdout, "", "{arguments}");
     }

@@ -1,4 +1,5 @@
-//! `--preset published`: each training for a step or two with every network of its method, and each method's own form of use.
+//! `--preset published`: each training for one or two steps with every network of its method, and the published form of each
+//! method.
 
 use serde_json::Value;
 use sixfold_io::write_mask;
@@ -25,7 +26,7 @@ fn pix2pose_trains_and_estimates_as_published() {
         assert_eq!(model.card().extra["training"]["whole_mask"], true);
     }
     fails(dir, &format!("{train} --network compact --out no"), &["--preset", "published", "compact"]);
-    // Ours, trained for a moment, in the published form of estimation: no pose is aligned with the image.
+    // The compact network, trained briefly, in the published form of estimation: no pose is aligned with the image.
     sixfold(
         dir,
         "train pix2pose --dataset tiny --ids 1 --size 64 --per-object 4 --render-share 0 --steps 120 --out ours",
@@ -103,7 +104,7 @@ fn mttm_trains_and_estimates_as_published() {
         "train mttm --preset published --steps 1 --anchors 2 --objects 16 --scenes 4 --out mttm --json";
     let losses = sixfold(dir, train).expect(0).json()["losses"].clone();
     assert!(losses["mask"].as_f64().is_some_and(f64::is_finite), "{losses}");
-    // With the network that ships: its masks are those of the estimate, before anything was aligned.
+    // With the shipped network: its masks are those of the estimate before alignment.
     let estimate = "estimate --method mttm --preset published --depth depth.png --camera camera.json \
         --object part.ply --unit mm --min-score 0 --json";
     let run = sixfold(dir, &format!("{estimate} --out out")).expect(0).json();

@@ -1,4 +1,5 @@
-//! `sixfold serve`: refused by the name of its feature where that is off, else what it refuses to start with.
+//! `sixfold serve`: refused with the name of its feature if that is off; otherwise, invalid options are
+//! refused at the start.
 
 use crate::support::*;
 

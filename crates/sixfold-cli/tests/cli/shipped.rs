@@ -1,6 +1,6 @@
-//! The weights in `weights/` on real frames: scores that a change may not lower unnoticed. What they are compared with is what
-//! `benches/results.sh` measured and keeps in `results/`, less two standard errors. Needs the folder that `SIXFOLD_DATA` names, or
-//! `../shared/data` beside the repository, and skips without.
+//! The weights in `weights/` on real frames: scores that a change must not lower unnoticed. They are compared with those that
+//! `benches/results.sh` measured and stored in `results/`, minus two standard errors. Needs the folder that `SIXFOLD_DATA` names,
+//! or `../shared/data` beside the repository; without it the tests are skipped.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -16,7 +16,7 @@ fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../..")
 }
 
-/// LM-O, where it is.
+/// The folder of LM-O, if it is available.
 fn lmo() -> Option<PathBuf> {
     let folder =
         std::env::var_os("SIXFOLD_DATA").map_or_else(|| root().join("../shared/data"), PathBuf::from);
@@ -28,7 +28,7 @@ fn lmo() -> Option<PathBuf> {
     None
 }
 
-/// Every eighth of the frames that the weights were not trained on, as a file of targets; how many targets.
+/// Writes every eighth of the frames that were not used for training as a file of targets; returns the number of targets.
 fn every_eighth(lmo: &Path, weights: &Path, file: &Path) -> usize {
     let card = read_card(weights).unwrap();
     let trained: BTreeSet<(u32, u32)> =
@@ -49,13 +49,13 @@ fn every_eighth(lmo: &Path, weights: &Path, file: &Path) -> usize {
     rows.len()
 }
 
-/// What is kept of a run of `benches/results.sh`.
+/// The stored result of a run of `benches/results.sh`.
 fn kept(name: &str) -> Value {
     let text = std::fs::read_to_string(root().join("results").join(format!("{name}.json"))).unwrap();
     serde_json::from_str::<Value>(&text).unwrap()["values"]["scores"].clone()
 }
 
-/// Each score is at least what was measured, less two standard errors of a fraction of so many.
+/// Each score is at least the measured one minus two standard errors of a fraction of `count`.
 fn assert_kept(found: &Value, measured: &Value, scores: &[&str], count: usize) {
     for score in scores {
         let (found, measured) = [found, measured].map(|v| v.pointer(score).unwrap().as_f64().unwrap()).into();

@@ -33,7 +33,7 @@ fn simulated_depth_can_be_estimated_on() {
     assert!(near as f64 > 0.95 * differences.len() as f64);
     assert!(differences.iter().any(|d| *d > 5e-4));
 
-    // What is there is not overwritten; the same seed gives the same bytes, another seed others.
+    // Existing files are not overwritten; the same seed gives the same bytes, another seed different ones.
     fails(tiny.path(), simulate, &["simulated", "exists"]);
     for (seed, same) in [(0, true), (3, false)] {
         let out = format!("again{seed}");

@@ -10,7 +10,7 @@ use crate::support::*;
 /// Two scenes of two small images with synthetic objects.
 const SMALL: &str = "simulate-scenes --families can,box --toys 2 --scenes 2 --views 2 --objects-per-scene 3,5 --camera camera.json";
 
-/// All files below a folder but its images of everything.
+/// All files below a folder except its overview images.
 fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
     let mut all = BTreeMap::new();
     let mut open = vec![folder.to_path_buf()];
@@ -80,14 +80,14 @@ fn scenes_are_a_dataset_of_their_own() {
     assert!(score["ar_mssd"].as_f64().unwrap() > 0.999, "{score}");
     assert!(image::open(dir.join("new/preview.png")).is_ok());
 
-    // Its camera file is one that `estimate` takes.
+    // `estimate` accepts its camera file.
     let found = sixfold(
         dir,
         "estimate --depth new/test/000000/depth/000000.png --camera new/camera.json --object part.ply --unit mm",
     );
     assert!([0, 1].contains(&found.code), "{found:?}");
 
-    // A scene that was not finished is made again, with the same bytes, by one thread as by many.
+    // An unfinished scene is made again with the same bytes, on one thread or many.
     let before = files(&dir.join("new"));
     std::fs::remove_file(dir.join("new/test/000001/scene_gt_info.json")).unwrap();
     std::fs::remove_file(dir.join("new/test/000001/depth/000001.png")).unwrap();
@@ -110,7 +110,7 @@ fn models_of_a_dataset_keep_their_ids() {
     assert!(!tiny.path().join("new/preview.png").exists());
     assert!(!tiny.path().join("new/test/000000/mask").exists());
     fails(tiny.path(), "simulate-scenes --dataset tiny --ids 7 --out other", &["--ids", "found 7", "1, 2"]);
-    // Another dataset is not written over.
+    // Another dataset is not overwritten.
     fails(tiny.path(), "simulate-scenes --dataset tiny --out tiny", &["tiny", "another dataset", "--out"]);
 }
 

@@ -1,4 +1,4 @@
-//! What the tests share: running the binary, a small object without symmetry, and what a depth camera sees of it.
+//! Shared parts of the tests: running the binary, a small object without symmetry, and its depth images.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -16,7 +16,7 @@ pub const HEIGHT: usize = 240;
 /// Metres per unit of the depth images written here.
 pub const DEPTH_SCALE: f64 = 1e-4;
 
-/// What the program left behind.
+/// The result of a run.
 #[derive(Debug)]
 pub struct Run {
     pub code: i32,
@@ -38,7 +38,7 @@ impl Run {
 /// The cache folder of the runs in a folder.
 const CACHE: &str = "cache-of-tests";
 
-/// The only file of this name in the cache of the runs in `dir`.
+/// The only file with this name in the cache of the runs in `dir`.
 pub fn cached(dir: &Path, name: &str) -> PathBuf {
     let folders = std::fs::read_dir(dir.join(CACHE)).unwrap().map(|entry| entry.unwrap().path());
     let files: Vec<PathBuf> = folders.map(|folder| folder.join(name)).filter(|file| file.is_file()).collect();
@@ -64,7 +64,7 @@ pub fn sixfold(dir: &Path, arguments: &str) -> Run {
     run
 }
 
-/// Runs a command that has to fail with exit status 2 and a message with all of `words` in one line.
+/// Runs a command that has to fail with exit status 2 and a message that contains all of `words` in one line.
 pub fn fails(dir: &Path, arguments: &str, words: &[&str]) {
     let run = sixfold(dir, arguments).expect(2);
     let good = run.stderr.lines().any(|line| words.iter().all(|w| line.contains(w)));
@@ -130,7 +130,8 @@ pub fn other_part() -> Mesh {
     Mesh::new(vertices, faces).unwrap()
 }
 
-/// On the table: `x` and `y` metres from its middle, rotated by `yaw`; the camera looks down at it from 0.6 m.
+/// A pose on the table: `x` and `y` metres from its centre, rotated by `yaw`; the camera looks down at it from
+/// 0.6 m.
 pub fn on_table(x: f64, y: f64, yaw: f64) -> Pose {
     let table = UnitQuaternion::from_axis_angle(&Vec3::x_axis(), 140f64.to_radians());
     let turn = UnitQuaternion::from_axis_angle(&Vec3::z_axis(), yaw);
@@ -220,7 +221,7 @@ pub fn assert_near(found: &Pose, truth: &Pose) {
     assert!(millimetres < 5.0 && degrees < 3.0, "{millimetres:.1} mm, {degrees:.1} degrees off");
 }
 
-/// A BOP dataset `tiny` of one scene with three images, two objects, and what is on it.
+/// A BOP dataset `tiny` of one scene with three images and two objects.
 pub struct Tiny {
     pub dir: TempDir,
     pub truth: Vec<(u32, Vec<GroundTruth>)>,
@@ -310,14 +311,14 @@ impl Tiny {
     }
 }
 
-/// Replaces text in a file; it has to be there.
+/// Replaces text in a file; the text must exist.
 pub fn replace(file: &Path, from: &str, to: &str) {
     let text = std::fs::read_to_string(file).unwrap();
     assert!(text.contains(from), "{from:?} is not in {}: {text}", file.display());
     std::fs::write(file, text.replacen(from, to, 1)).unwrap();
 }
 
-/// Cuts a file to this fraction of its length.
+/// Truncates a file to this fraction of its length.
 pub fn truncate(file: &Path, share: f64) {
     let bytes = std::fs::read(file).unwrap();
     std::fs::write(file, &bytes[..(share * bytes.len() as f64) as usize]).unwrap();

@@ -48,7 +48,7 @@ fn a_training_set_of_new_views() {
     let scene = dataset.scene(1).unwrap();
     let image = scene.rgb(2).unwrap().unwrap();
     assert_eq!(image.size(), (96, 96));
-    // The part is painted in one colour: what is seen of it is of that colour, in light and shadow.
+    // The part has one colour: its visible pixels have that colour, in light and shadow.
     let mask = read_mask(&tiny.path().join("new/train_nol/000001/mask_visib/000002_000000.png")).unwrap();
     let photograph = read_rgb(&tiny.path().join("new/train_nol/000001/rgb/000006.png")).unwrap();
     let photographed =
@@ -68,7 +68,7 @@ fn a_training_set_of_new_views() {
     let covered = coordinates.pixels().filter(|p| p.0 != [0; 3]).count();
     assert_eq!(covered, mask.as_slice().iter().filter(|v| **v).count());
 
-    // What was lost is made again with the same bytes, by one thread as by many.
+    // Deleted files are made again with the same bytes, on one thread or many.
     let before = files(&tiny.path().join("new"));
     for lost in ["coordinates/000001.png", "coordinates/000004.png", "rgb/000004.png"] {
         std::fs::remove_file(tiny.path().join("new/train_nol/000002").join(lost)).unwrap();
@@ -79,7 +79,7 @@ fn a_training_set_of_new_views() {
     assert!(differing.is_empty() && before.len() == after.len(), "{differing:?}");
     fails(tiny.path(), &format!("{} --seed 4 --with-photographs", few("new")), &["another seed", "--out"]);
 
-    // A training takes it as it is.
+    // A training can use it directly.
     let train = "train pix2pose --dataset new --split train_nol --render-share 0 --size 64 --steps 2 --out trained --json";
     let trained = sixfold(tiny.path(), train).expect(0).json();
     assert_eq!(trained["photographs"], 18);
@@ -96,7 +96,7 @@ fn the_camera_file_is_one_that_estimate_takes() {
     let file = sixfold_io::CameraFile::read(&dir.join("new/camera.json")).unwrap();
     let (written, of_image) = (file.camera, scene.camera(first).unwrap());
     assert!(file.sized && written == of_image, "{written:?} {of_image:?}");
-    // What that camera sees at the first image's pose; the part's own sides are the only planes.
+    // The view of that camera at the first image's pose; the part's own sides are the only planes.
     let pose = scene.image(first).unwrap().ground_truth[0].camera_from_object;
     let part = part();
     let part = SceneObject { mesh: &part, camera_from_object: pose };
@@ -127,7 +127,7 @@ fn disturbed_poses_come_back() {
         assert!(given.distance_to(&truth) > 1e-4);
         assert!(pose_of(&entry["undisturbed"]).distance_to(&truth) < 1e-6);
         assert!(entry["moved_mm"].as_f64().unwrap() > 0.0);
-        // Across the optical axis, where an image says most.
+        // Perpendicular to the optical axis, where an image is most informative.
         let across = |pose: &sixfold_geometry::Pose| {
             let off = pose.translation() - truth.translation();
             off.x.hypot(off.y)
@@ -173,7 +173,7 @@ fn photographs_of_a_file_and_what_may_be_wrong_with_them() {
     let json = sixfold(tiny.path(), &format!("{run} --out a --json")).expect(0).json();
     assert_eq!((&json["objects"][0]["photographs"], &json["objects"][0]["images"]), (&3.into(), &4.into()));
 
-    // One photograph: most of the object is unseen, and said to be.
+    // One photograph: most of the object is unseen, and this is reported.
     let file: Value =
         serde_json::from_slice(&std::fs::read(tiny.path().join("photographs.json")).unwrap()).unwrap();
     let mut one = file.clone();
@@ -195,7 +195,7 @@ fn photographs_of_a_file_and_what_may_be_wrong_with_them() {
     assert!(masked.stderr.contains("the mask covers 0 %"), "{}", masked.stderr);
     assert_eq!(masked.json()["objects"][0]["photographs"], 2);
 
-    // A mask of another size, a pose outside the image, a camera of another image, fields that are not there.
+    // A mask of another size, a pose outside the image, a camera of another image, missing fields.
     write_mask(&tiny.path().join("small.png"), &Mask::filled(32, 24, true)).unwrap();
     let run = photographs(&tiny, |_, entry| entry["mask"] = "small.png".into());
     fails(tiny.path(), &format!("{run} --out b"), &["mask is 32x24", "320x240"]);

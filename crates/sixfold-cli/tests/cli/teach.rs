@@ -1,4 +1,4 @@
-//! `sixfold teach`: an object from photographs, found in a new depth image; photographs that teach nothing.
+//! `sixfold teach`: an object from photographs, found in a new depth image; and unusable photographs.
 
 use std::path::Path;
 
@@ -40,7 +40,7 @@ fn write_camera(path: &Path) {
     std::fs::write(path, text.to_string()).unwrap();
 }
 
-/// Writes `count` photographs; where the wedge stood.
+/// Writes `count` photographs; returns the wedge's pose.
 fn write_photographs(folder: &Path, count: usize) -> Pose {
     std::fs::create_dir(folder).unwrap();
     let (mesh, ground) =
@@ -73,7 +73,7 @@ fn a_taught_object_is_found_in_a_new_depth_image() {
         assert!(case.path().join("out/teach/wedge").join(file).is_file(), "{file}");
     }
     fails(case.path(), teach, &["wedge", "--replace"]);
-    // The wedge on a table, seen by a depth camera.
+    // The wedge on a table, viewed by a depth camera.
     let mesh = wedge();
     let table = [[-0.4, -0.4], [0.4, -0.4], [0.4, 0.4], [-0.4, 0.4]].map(|[x, y]| Vec3::new(x, y, 0.0));
     let table = Mesh::new(table.to_vec(), vec![[0, 1, 2], [0, 2, 3]]).unwrap();
@@ -95,7 +95,7 @@ fn a_taught_object_is_found_in_a_new_depth_image() {
     .expect(0);
     let found = run.json();
     let found = pose_of(&found["poses"][0]["camera_from_object"]);
-    // The middle of the taught mesh's box is the middle of the wedge's, rotated as it stood.
+    // The centre of the taught mesh's box is that of the wedge's, rotated like the wedge.
     let centre = camera_from_table.transform_point(&Vec3::new(0.0, 0.0, 0.045));
     assert!((found.translation() - centre).norm() < 0.008, "{found:?} {centre:?}");
     let up = found.transform_direction(&Vec3::z()).dot(&camera_from_table.transform_direction(&Vec3::z()));

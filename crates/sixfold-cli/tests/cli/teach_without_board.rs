@@ -1,4 +1,5 @@
-//! `sixfold teach --no-board`: an object from photographs of it on a patterned cloth, and what is said where they cannot teach.
+//! `sixfold teach --no-board`: an object from photographs of it on a patterned cloth, and the messages for unusable
+//! photographs.
 
 use std::path::Path;
 
@@ -27,7 +28,7 @@ fn block() -> Mesh {
     mesh.with_colors((0..8).map(|i| [240 - 10 * i, 90 + 12 * i, 30]).collect()).unwrap()
 }
 
-/// Writes the photographs; the options that say how large everything is.
+/// Writes the photographs; returns the options for the scale.
 fn write_photographs(folder: &Path) -> String {
     std::fs::create_dir(folder).unwrap();
     let (mesh, cloth, table) = (block(), patterned(1024, 2), RgbImage::filled(8, 8, [110, 105, 95]));

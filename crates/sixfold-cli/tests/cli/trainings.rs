@@ -1,4 +1,4 @@
-//! Trainings on other data than those in their folder, two at once in one folder, and options that no training can have.
+//! Trainings on other data than those in their folder, two at once in one folder, and invalid options.
 
 use std::time::{Duration, Instant};
 
@@ -10,7 +10,7 @@ const PIX2POSE: &str =
     "train pix2pose --dataset tiny --size 64 --per-object 1 --render-share 0 --steps 2 --out trained";
 const DETECTOR: &str = "train detector --dataset tiny --size 96 --batch 1 --steps 2 --out trained";
 
-/// Puts another file in place of one of the dataset while `run` runs.
+/// Replaces a file of the dataset while `run` runs.
 fn with_another(tiny: &Tiny, file: &str, other: &[u8], run: impl FnOnce()) {
     let file = tiny.file(file);
     let before = std::fs::read(&file).unwrap();
@@ -38,7 +38,7 @@ fn a_training_on_other_data_is_refused_and_signs_no_card() {
         };
         let model = kept();
         let refused = |command: &str, words: &[&str]| {
-            // To be resumed, or taken as done, and exported.
+            // For a resumed or finished training, and for an export.
             for end in ["", " --export"] {
                 let words = [&["trained", "other inputs", "another folder"], words].concat();
                 fails(dir, &format!("{command}{end}"), &words);
@@ -62,12 +62,12 @@ fn a_training_on_other_data_is_refused_and_signs_no_card() {
         write_ply(dir.join("larger.ply"), &mesh, Unit::Millimetre, PlyFormat::BinaryLittleEndian).unwrap();
         let larger = std::fs::read(dir.join("larger.ply")).unwrap();
         with_another(&tiny, "models/obj_000001.ply", &larger, || refused(&same, &["mesh of object 1 was"]));
-        // Weights to begin with, and photographs for backgrounds.
+        // Initial weights, and photographs for backgrounds.
         std::fs::create_dir(dir.join("photographs")).unwrap();
         std::fs::copy(tiny.file("test/000007/rgb/000004.png"), dir.join("photographs/a.png")).unwrap();
         refused(&format!("{same} --backgrounds photographs"), &[r#"backgrounds was "none", is "1 files"#]);
         refused(&format!("{same} --init trained/model.safetensors"), &["init was null, is"]);
-        // Elsewhere, the same is the same.
+        // The same data at another path count as the same.
         std::fs::rename(dir.join("tiny"), dir.join("moved")).unwrap();
         sixfold(dir, &same.replace("tiny", "moved")).expect(0);
     }
@@ -118,7 +118,7 @@ fn two_trainings_in_one_folder_one_is_refused() {
     let words = ["trained", "another process", &format!("({})", first.id())];
     fails(tiny.path(), &second, &words);
     fails(tiny.path(), &format!("{second} --export"), &words);
-    // Killed, it locks nothing.
+    // After it was killed, nothing is locked.
     first.kill().unwrap();
     first.wait().unwrap();
     sixfold(tiny.path(), &format!("{second} --export")).expect(0);
@@ -179,7 +179,7 @@ fn options_that_no_training_can_have() {
     ];
     for (command, message) in cases {
         fails(tiny.path(), &command, &[message]);
-        // Nothing was begun.
+        // Nothing was started.
         assert!(!tiny.path().join("trained").exists(), "{command}");
     }
 }

@@ -1,4 +1,4 @@
-//! The program without the feature `networks`: what needs one is refused by the feature's name.
+//! The program without the feature `networks`: commands that need one are refused with the feature's name.
 
 use crate::support::*;
 

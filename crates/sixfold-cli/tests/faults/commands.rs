@@ -38,25 +38,25 @@ fn dataset(folder: &Path) {
     copy(&CASE, folder);
 }
 
-/// The dataset, of which one target is looked for.
+/// The dataset with one target.
 fn one_target(folder: &Path) {
     dataset(folder);
     fs::copy(folder.join("targets.json"), folder.join("tiny/test_targets_bop19.json")).unwrap();
 }
 
-/// What another row's command wrote.
+/// A file that another row's command wrote.
 fn of(row: &Row, file: &str) -> PathBuf {
     reference(row).folder().join(file)
 }
 
-/// The dataset with the networks that the trainings of this table end with.
+/// The dataset with the networks made by the trainings of this table.
 fn dataset_and_networks(folder: &Path) {
     dataset(folder);
     fs::copy(of(&train_pix2pose::ROW, "out/model.safetensors"), folder.join("pix2pose.safetensors")).unwrap();
     fs::copy(of(&train_detector::ROW, "out/model.safetensors"), folder.join("detector.safetensors")).unwrap();
 }
 
-/// The dataset with detections of everything.
+/// The dataset with detections of all objects.
 fn detections(folder: &Path) {
     dataset(folder);
     fs::copy(of(&detect_dataset::ROW, "found.json"), folder.join("found.json")).unwrap();
@@ -156,7 +156,7 @@ rows! {
     demo: one_target, ["out", "demo.json"], None, "demo --data tiny --out out --json demo.json";
 }
 
-/// Killed between its last checkpoint and the figure of its curves, a training has nothing left to do but the figure.
+/// Killed between its last checkpoint and the figure of its curves, a training only has to make the figure.
 #[test]
 fn a_training_without_its_curves_gets_them() {
     let folder = tempfile::tempdir().unwrap();

@@ -1,4 +1,5 @@
-//! What all drivers of faults share: a row of the table of commands, its folder, its undisturbed run, and runs with a limit.
+//! Shared parts of the fault drivers: a row of the table of commands, its folder, its undisturbed run, and runs with a time
+//! limit.
 
 use std::collections::BTreeMap;
 use std::fs::{self, File};
@@ -15,21 +16,21 @@ use crate::support::Run;
 /// A command that writes.
 #[derive(Clone, Copy)]
 pub struct Row {
-    /// Of the test.
+    /// Name of the test.
     pub name: &'static str,
-    /// Puts what the command works on into an empty folder.
+    /// Puts the inputs of the command into an empty folder.
     pub prepare: fn(&Path),
-    /// With blanks between them.
+    /// Arguments separated by blanks.
     pub arguments: &'static str,
-    /// Beginnings of what it writes, one of which a message about writing has to name.
+    /// Prefixes of the paths that it writes; a message about writing has to name one of them.
     pub writes: &'static [&'static str],
-    /// What else the command may end with when it is given again after it was complete: an exit status and words of its message.
+    /// An alternative result when the command is run again after completion: an exit status and words of its message.
     pub again: Option<(i32, &'static str)>,
 }
 
-/// A run that nothing disturbed.
+/// An undisturbed run.
 pub struct Reference {
-    /// Where it ran.
+    /// The folder in which it ran.
     folder: PathBuf,
     /// Files after it.
     pub tree: Tree,
@@ -42,26 +43,27 @@ pub struct Reference {
 }
 
 impl Reference {
-    /// The folder it ran in, which is not to be changed.
+    /// The folder in which it ran; it must not be changed.
     pub fn folder(&self) -> &Path {
         &self.folder
     }
 }
 
-/// Longer than any command of the table takes: a run that is not done by then hangs.
+/// Longer than any command of the table takes: a run that is not done by then counts as hanging.
 const LIMIT: Duration = Duration::from_secs(300);
 
-/// The program that is tested: that of this build, or the one that `SIXFOLD_PROGRAM` names, such as an installed one.
+/// The program under test: from this build, or the one that `SIXFOLD_PROGRAM` names, such as an installed one.
 pub fn program() -> PathBuf {
     std::env::var_os("SIXFOLD_PROGRAM").map_or_else(|| crate::PROGRAM.into(), PathBuf::from)
 }
 
-/// Whether all moments and values are wanted.
+/// Whether all moments and values are tested.
 pub fn thorough() -> bool {
     std::env::var_os("SIXFOLD_FAULTS").is_some_and(|v| v == "all")
 }
 
-/// A folder of this process for what several tests read. The next process removes it: nothing runs when the last test is done.
+/// A folder of this process for files that several tests read. The next process removes it, because no code runs after the last
+/// test.
 pub fn kept(name: &str) -> PathBuf {
     static ROOT: LazyLock<PathBuf> = LazyLock::new(|| {
         let all = Path::new(env!("CARGO_TARGET_TMPDIR")).join("faults");
@@ -78,12 +80,12 @@ pub fn kept(name: &str) -> PathBuf {
     folder
 }
 
-/// What methods derive from meshes, kept for all runs: it is no result.
+/// The cache of derived data of meshes, shared by all runs, since it is not a result.
 fn cache() -> PathBuf {
     kept("cache")
 }
 
-/// Whether a row takes too long for a run that was not asked to be thorough: it shares all that writes with quicker ones.
+/// Whether a row takes too long for a run that is not thorough: quicker rows cover all of its writing code.
 pub fn is_left_out(row: &Row) -> bool {
     let left_out = !thorough() && ["train_nol", "train_mttm"].contains(&row.name);
     if left_out {
@@ -92,7 +94,7 @@ pub fn is_left_out(row: &Row) -> bool {
     left_out
 }
 
-/// A folder with what a row works on.
+/// A folder with the inputs of a row.
 pub fn prepared(row: &Row) -> TempDir {
     let folder = tempfile::tempdir().unwrap();
     (row.prepare)(folder.path());
@@ -148,7 +150,7 @@ pub fn command(row: &Row, folder: &Path) -> Command {
     command
 }
 
-/// Where a run happens, and where it keeps what it derives.
+/// Sets the folder of a run and its cache.
 pub fn environment(command: &mut Command, folder: &Path) {
     command.current_dir(folder).env_remove("SIXFOLD_STORE").env("SIXFOLD_CACHE", cache());
 }
@@ -159,7 +161,7 @@ pub struct Started {
     output: TempDir,
 }
 
-/// Starts a command whose output goes to files, which no pipe's size holds up.
+/// Starts a command with its output in files, so that a full pipe cannot block it.
 pub fn start(mut command: Command) -> Started {
     let output = tempfile::tempdir().unwrap();
     let file = |name: &str| File::create(output.path().join(name)).unwrap();
@@ -173,7 +175,7 @@ impl Started {
         self.child.try_wait().unwrap().is_some()
     }
 
-    /// Ends it as the system does when memory is short. Whether it was still running.
+    /// Kills it as the system does when memory is short. Returns whether it was still running.
     pub fn kill(&mut self) -> bool {
         let running = !self.is_done();
         self.child.kill().unwrap();
@@ -187,7 +189,7 @@ impl Started {
         (code, String::from_utf8_lossy(&fs::read(self.output.path().join("err")).unwrap()).into_owned())
     }
 
-    /// Waits for its end, not for ever.
+    /// Waits for its end, with a time limit.
     pub fn wait(mut self) -> Run {
         let began = Instant::now();
         while !self.is_done() {
@@ -212,7 +214,7 @@ pub fn run(row: &Row, folder: &Path) -> Run {
     start(command(row, folder)).wait()
 }
 
-/// Whether a run ended as the undisturbed one, or as one that found everything done.
+/// Whether a run ended like the undisturbed one, or like one that found everything done.
 pub fn ended_well(row: &Row, run: &Run) -> bool {
     run.code == reference(row).code
         || row.again.is_some_and(|(code, words)| {

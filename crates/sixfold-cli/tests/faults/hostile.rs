@@ -1,6 +1,6 @@
 //! Command lines with hostile values: every number and every file of every command, as its `--help` lists them, gets values that
-//! no number and no file of that kind may have. Each is refused with exit status 2 and a message that names the option, within ten
-//! seconds and two gigabytes.
+//! are invalid for it. Each is refused with exit status 2 and a message that names the option, within ten seconds and two
+//! gigabytes.
 
 use std::collections::BTreeMap;
 use std::fmt;
@@ -15,20 +15,20 @@ use tempfile::TempDir;
 use crate::commands;
 use crate::driver::{Row, environment, program, start, thorough};
 
-/// A run may compute for so long, as `ulimit -t` has it: other tests use the processors too.
+/// Limit of CPU time in seconds, for `ulimit -t`: other tests use the processors too.
 const SECONDS: u64 = 10;
-/// And a run that computes nothing may wait for so long.
+/// Limit of waiting time for a run that does not compute.
 const WAITING: Duration = Duration::from_secs(60);
-/// And so much memory, in kilobytes, as `ulimit -v` has it.
+/// Limit of memory in kilobytes, for `ulimit -v`.
 const KILOBYTES: u64 = 2_000_000;
 
-/// What values an option takes, by the name that its help has for them.
+/// The kind of values that an option takes, by their name in the help.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Kind {
     Number,
-    /// Something that is read.
+    /// A path that is read.
     Input,
-    /// Something that is written.
+    /// A path that is written.
     Output,
     Other,
 }
@@ -37,7 +37,7 @@ const NUMBERS: [&str; 16] = [
     "N", "RATE", "FRACTION", "DEGREES", "PIXELS", "SCORE", "MM", "METRES", "M", "ID", "WEIGHT", "DISTANCE",
     "SEED", "KG", "NUMBER", "NUMBERS",
 ];
-/// Options whose files and folders are made.
+/// Options whose files and folders are created.
 const OUTPUTS: [&str; 10] =
     ["out", "json", "overlays", "pictures", "picture", "curves", "write-truth", "cache", "store", "outbox"];
 
@@ -84,7 +84,7 @@ fn options(command: &str) -> Vec<Opt> {
     found
 }
 
-/// A command line that works, for each command: what a hostile value is put into.
+/// A working command line for each command, into which a hostile value is inserted.
 fn good() -> BTreeMap<&'static str, Row> {
     let of = |name: &str| *commands::ROWS.iter().find(|row| row.name == name).unwrap();
     let rows = [
@@ -122,7 +122,7 @@ fn good() -> BTreeMap<&'static str, Row> {
     good
 }
 
-/// Values that are refused for all numbers, but for those of [`ACCEPTED`].
+/// Values that are refused for all numbers, except those of [`ACCEPTED`].
 fn hostile_numbers() -> &'static [&'static str] {
     if thorough() {
         &["nan", "inf", "-1", "0", "1e308", "18446744073709551615", ""]
@@ -131,7 +131,7 @@ fn hostile_numbers() -> &'static [&'static str] {
     }
 }
 
-/// What is no file of any kind that a command reads. `FOLDER` and `FIFO` are made.
+/// Paths that are not valid files for any command. `FOLDER` and `FIFO` are created.
 fn hostile_files() -> &'static [&'static str] {
     if thorough() {
         &["FOLDER", "/dev/null", "/dev/zero", "FIFO", "", "missing"]
@@ -140,13 +140,13 @@ fn hostile_files() -> &'static [&'static str] {
     }
 }
 
-/// Hostile values that mean something: command (`*`: all), option, values.
+/// Hostile values that are valid: command (`*`: all), option, values.
 const ACCEPTED: &[(&str, &str, &[&str])] = &[
     // Any whole number is a seed.
     ("*", "seed", &["0", "18446744073709551615"]),
     // Above every confidence: nothing is found.
     ("estimate", "min-score", &["0", "1e308"]),
-    // However far an experience is, it proposes.
+    // Any distance of an experience is accepted.
     ("grasp learn", "near", &["0", "1e308"]),
 ];
 
@@ -158,7 +158,7 @@ fn is_accepted(option: &Opt, value: &str) -> bool {
     })
 }
 
-/// What went wrong with a hostile command line.
+/// A failure with a hostile command line.
 struct Finding {
     what: &'static str,
     line: String,
@@ -215,7 +215,7 @@ fn refused(folder: &Path, parts: &[String], words: &[&str]) -> Option<Finding> {
     } else if message.contains("memory allocation") {
         "memory"
     } else if code.is_none() {
-        // The system ended it.
+        // The system killed it.
         "hangs"
     } else if code != Some(2) {
         "accepted"
@@ -227,7 +227,7 @@ fn refused(folder: &Path, parts: &[String], words: &[&str]) -> Option<Finding> {
     Some(Finding { what, line: parts.join(" "), message: error.to_owned() })
 }
 
-/// An option as people and as fields write it: without hyphens, underscores and capitals.
+/// An option's name without hyphens, underscores and capitals, to compare flags with field names.
 fn plain(text: &str) -> String {
     text.replace(['-', '_'], " ").to_lowercase().trim().to_owned()
 }
@@ -306,7 +306,7 @@ fn files_that_are_read() {
     try_all(Kind::Input, hostile_files());
 }
 
-/// Command lines that are no single value on a working one: row whose inputs they get, arguments, words of the message.
+/// Command lines that differ from a working one in more than one value: row of the inputs, arguments, words of the message.
 const TABLE: &[(&str, &str, &[&str])] = &[
     ("render", "--threads 100000 render --object part.ply --unit mm --out out", &["--threads", "100000"]),
     ("render", "--threads 0 render --object part.ply --unit mm --out out", &["--threads"]),
@@ -390,7 +390,7 @@ const TABLE: &[(&str, &str, &[&str])] = &[
     ),
 ];
 
-/// A PNG file that says it has 60,000 x 60,000 pixels of 16 bits, and a camera that is as large, and one of half a pixel.
+/// A PNG file whose header states 60,000 x 60,000 pixels of 16 bits, a camera of that size, and a camera of half a pixel.
 fn bombs(folder: &Path) {
     let mut png = fs::read(folder.join("depth.png")).unwrap_or_default();
     if png.len() > 24 {

@@ -1,4 +1,4 @@
-//! A command is killed at any moment; given again, it ends with the bytes of an undisturbed run, and nothing else stays.
+//! A command is killed at any moment; run again, it ends with the bytes of an undisturbed run and leaves no other files.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -11,7 +11,7 @@ use crate::outputs::{differences, fingerprint, leftovers, tree};
 enum Moment {
     /// At this fraction of an undisturbed run's time.
     Time(f64),
-    /// When the files below its folder have changed this often.
+    /// When the files below its folder have changed this many times.
     Change(usize),
 }
 
@@ -54,7 +54,7 @@ fn wait_for(moment: Moment, duration: Duration, run: &mut Started, folder: &Path
     }
 }
 
-/// Kills a row's command at several moments, each time in a new folder, and lets it go on.
+/// Kills a row's command at several moments, each time in a new folder, and runs it again.
 pub fn killed_and_restarted(row: &Row) {
     let reference = reference(row);
     let mut wrong = vec![];

@@ -1,5 +1,5 @@
-//! What a command left on the disk, in a form that two runs of the same command have in common: without what a clock measured,
-//! and a store of experiences as what it holds.
+//! The files that a command wrote, in a form that is equal for two runs of the same command: without measured times, and with
+//! a store of experiences represented by its content.
 
 use std::collections::BTreeMap;
 use std::fs;
@@ -12,7 +12,7 @@ use crate::support::sixfold;
 /// All files below a folder, by their path in it.
 pub type Tree = BTreeMap<PathBuf, Vec<u8>>;
 
-/// All paths below a folder, those of folders too.
+/// All paths below a folder, including folders.
 fn paths(folder: &Path) -> Vec<PathBuf> {
     let mut all = vec![];
     let mut open = vec![folder.to_path_buf()];
@@ -36,12 +36,12 @@ fn is_temporary(path: &Path) -> bool {
         || [".tmp", ".lock", "-journal", "-wal", "-shm"].iter().any(|end| name.ends_with(end))
 }
 
-/// Temporary files, lock files and journals of a database that lie below a folder.
+/// Temporary files, lock files and database journals below a folder.
 pub fn leftovers(folder: &Path) -> Vec<PathBuf> {
     paths(folder).into_iter().filter(|p| is_temporary(p)).collect()
 }
 
-/// Length and name of everything below a folder: what changes when something is written.
+/// Name and length of all files below a folder, which change when something is written.
 pub fn fingerprint(folder: &Path) -> Vec<(PathBuf, u64)> {
     let length = |path: &Path| fs::metadata(path).map_or(0, |m| if m.is_file() { m.len() } else { 0 });
     let mut all: Vec<_> = paths(folder).into_iter().map(|p| (p.clone(), length(&p))).collect();
@@ -49,12 +49,12 @@ pub fn fingerprint(folder: &Path) -> Vec<(PathBuf, u64)> {
     all
 }
 
-/// The bytes that the files below a folder take.
+/// The total size of the files below a folder.
 pub fn size(folder: &Path) -> u64 {
     fingerprint(folder).iter().map(|(_, length)| length).sum()
 }
 
-/// What lies below a folder, comparable.
+/// The files below a folder in comparable form.
 pub fn tree(folder: &Path) -> Tree {
     let mut tree = Tree::new();
     for path in paths(folder).into_iter().filter(|p| p.is_file()) {
@@ -66,11 +66,11 @@ pub fn tree(folder: &Path) -> Tree {
             "json" | "jsonl" | "csv" | "md" => {
                 tree.insert(name, without_times(&end, bytes));
             }
-            // Holds parameters under random names and the time; the model that comes of it is compared.
+            // Holds parameters under random names and the time; the resulting model is compared.
             "checkpoint" => {
                 tree.insert(name, vec![]);
             }
-            // Shows how many samples a second were learnt from.
+            // Shows the number of samples per second.
             _ if name.ends_with("training/curves.png") => {
                 let size =
                     image::image_dimensions(&path).map_or_else(|e| e.to_string(), |s| format!("{s:?}"));
@@ -84,11 +84,11 @@ pub fn tree(folder: &Path) -> Tree {
     tree
 }
 
-/// What a store of experiences holds, as its own command writes it.
+/// The content of a store of experiences, as exported by its own command.
 fn store(file: &Path) -> Tree {
     let folder = tempfile::tempdir().unwrap();
     let copy = folder.path().join("copy.db");
-    // Reading may make files beside a store.
+    // Reading may create files beside a store.
     fs::copy(file, &copy).unwrap();
     let run = sixfold(folder.path(), "grasp store export copy.db --out files --json report.json");
     if run.code > 1 {
@@ -101,7 +101,7 @@ fn store(file: &Path) -> Tree {
     held
 }
 
-/// The bytes of a file without what a clock measured; those of a broken file as they are.
+/// The bytes of a file without measured times; those of an invalid file are unchanged.
 fn without_times(end: &str, bytes: Vec<u8>) -> Vec<u8> {
     let Ok(text) = std::str::from_utf8(&bytes) else { return bytes };
     match end {
@@ -110,7 +110,7 @@ fn without_times(end: &str, bytes: Vec<u8>) -> Vec<u8> {
                 .split_inclusive('\n')
                 .map(|line| line.rsplit_once(',').map_or(line.to_owned(), |(row, _)| format!("{row}\n")))
                 .collect();
-            // What has no end is no line.
+            // Text without a line end is not a line.
             if !text.ends_with('\n') {
                 cut.push_str("(cut off)");
             }
@@ -134,7 +134,7 @@ fn without_times(end: &str, bytes: Vec<u8>) -> Vec<u8> {
                     && cell.chars().all(|c| c.is_ascii_digit() || matches!(c, '.' | '+' | ' '))
                     && cell.contains(" + ")
             };
-            // The columns whose head says milliseconds.
+            // The columns with milliseconds in the header.
             let mut columns: Vec<bool> = vec![];
             let lines = text.lines().map(|line| {
                 let cells: Vec<&str> = line.split('|').collect();
@@ -155,7 +155,7 @@ fn without_times(end: &str, bytes: Vec<u8>) -> Vec<u8> {
     }
 }
 
-/// A value without the fields that a clock measured, and without the name that a journal draws for itself.
+/// A value without measured times and without the random name of a journal.
 fn timeless(value: Value) -> Value {
     match value {
         Value::Object(fields) => {
@@ -170,7 +170,7 @@ fn timeless(value: Value) -> Value {
     }
 }
 
-/// In what two trees differ, a few lines.
+/// The differences of two trees, in a few lines.
 pub fn differences(expected: &Tree, found: &Tree) -> Vec<String> {
     let mut lines: Vec<String> = vec![];
     for (path, bytes) in expected {
@@ -188,7 +188,7 @@ pub fn differences(expected: &Tree, found: &Tree) -> Vec<String> {
     lines
 }
 
-/// Where two files differ first.
+/// The first difference of two files.
 fn first(expected: &[u8], found: &[u8]) -> String {
     let at = expected.iter().zip(found).take_while(|(a, b)| a == b).count();
     let part = |bytes: &[u8]| {

@@ -1,5 +1,5 @@
-//! A table of commands becomes tests: every driver on every row. The columns: name, inputs, beginnings of what is written, what
-//! the command may say when all is done already, arguments.
+//! Makes tests from a table of commands: every driver on every row. The columns: name, inputs, prefixes of written paths, the
+//! message when everything is done already, arguments.
 
 macro_rules! rows {
     ($($name:ident: $prepare:expr, $writes:expr, $again:expr, $arguments:expr;)*) => {

@@ -1,5 +1,5 @@
-//! A disk that fills up while a command writes: it says so, harms nothing that was there, and is completed by the same command
-//! once there is space. The disk is a small file system in memory, mounted in a name space of its own.
+//! A disk that fills up while a command writes: the command reports it, damages no existing files, and can be completed by the
+//! same command once there is space. The disk is a small file system in memory, mounted in a name space of its own.
 
 use std::fs;
 use std::path::Path;
@@ -13,9 +13,9 @@ use crate::support::Run;
 /// Whether file systems can be mounted without changing anything outside.
 #[derive(Clone, Copy)]
 pub enum Jail {
-    /// Makes a command that runs others where mounts are its own.
+    /// Makes a command that runs others in their own mount name space.
     Ready(fn(&[&str]) -> Command),
-    /// Not here.
+    /// Not available here.
     Missing,
 }
 
@@ -31,7 +31,7 @@ fn as_user(arguments: &[&str]) -> Command {
     command
 }
 
-/// Finds out once.
+/// Determined once.
 pub fn jail() -> Jail {
     static JAIL: OnceLock<Jail> = OnceLock::new();
     *JAIL.get_or_init(|| {
@@ -45,7 +45,7 @@ pub fn jail() -> Jail {
     })
 }
 
-/// Runs a command twice on a small disk: with little space, then with enough. What is there after each run is copied out.
+/// Runs a command twice on a small disk: with little space, then with enough. The files after each run are copied out.
 const SCRIPT: &str = r#"
 set -e
 disk=$1 from=$2 free=$3 results=$4
@@ -65,7 +65,7 @@ echo $? >"$results/code2"
 cp -a . "$results/after"
 "#;
 
-/// A run on the small disk and what it left.
+/// A run on the small disk and its files.
 struct Ended {
     run: Run,
     folder: std::path::PathBuf,
@@ -110,7 +110,7 @@ fn says_it(row: &Row, stderr: &str) -> bool {
     })
 }
 
-/// Fills the disk while a row's command writes, and when everything was written before.
+/// Fills the disk while a row's command writes, and after everything was written.
 pub fn small_disk(row: &Row) {
     let Jail::Ready(wrap) = jail() else {
         println!("skipped: no file system can be mounted here (needs root, or name spaces for users)");
@@ -126,7 +126,7 @@ pub fn small_disk(row: &Row) {
         let free = kilobytes * fraction / 100;
         let [full, after] = on_small_disk(wrap, row, folder.path(), free, results.path());
         let at = format!("{free} kB free of {kilobytes} kB needed");
-        // A command that removes something may need no room.
+        // A command that removes something may need no space.
         let done = full.run.code == 0 && completed(row, &full).is_empty();
         let refused = full.run.code == 2 && says_it(row, &full.run.stderr);
         if !(done || refused) || full.run.stderr.contains("panicked") {
@@ -138,7 +138,7 @@ pub fn small_disk(row: &Row) {
         wrong.extend(harmed(&before, &tree(&full.folder)).iter().map(|d| format!("{at}: {d}")));
         wrong.extend(completed(row, &after).iter().map(|d| format!("{at}, then enough: {d}")));
     }
-    // What an earlier run wrote stays, or is replaced by the same.
+    // Files of an earlier run stay, or are replaced by the same content.
     let results = tempfile::tempdir().unwrap();
     let [full, after] = on_small_disk(wrap, row, reference.folder(), 0, results.path());
     if full.run.stderr.contains("panicked") {
@@ -149,7 +149,7 @@ pub fn small_disk(row: &Row) {
     assert!(wrong.is_empty(), "on a full disk: sixfold {}\n{}", row.arguments, wrong.join("\n"));
 }
 
-/// Which of the files that were there are other ones now, or gone.
+/// The earlier files that have changed or are missing.
 fn harmed(before: &Tree, now: &Tree) -> Vec<String> {
     let kept: Tree = now
         .iter()
@@ -159,7 +159,7 @@ fn harmed(before: &Tree, now: &Tree) -> Vec<String> {
     differences(before, &kept)
 }
 
-/// What is wrong with the run that had enough space.
+/// The failures of the run with enough space.
 fn completed(row: &Row, after: &Ended) -> Vec<String> {
     if !ended_well(row, &after.run) {
         return vec![format!("exit status {}: {}", after.run.code, after.run.stderr.trim())];

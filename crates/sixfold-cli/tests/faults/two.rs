@@ -1,11 +1,12 @@
-//! The same command twice at once on the same output: both end with the right output, or one is refused and says why.
+//! The same command twice at once on the same output: both end with the right output, or one is refused with a
+//! reason.
 
 use std::time::Duration;
 
 use crate::driver::{Row, command, ended_well, prepared, reference, start, thorough};
 use crate::outputs::{differences, leftovers, tree};
 
-/// Words of a refusal that says why.
+/// Words of a refusal with a reason.
 const WHY: [&str; 3] = ["another process", "exists", "there is already"];
 
 /// Runs a row's command twice at once.

@@ -7,7 +7,7 @@ use crate::driver::{Row, command, prepared, reference, start};
 use crate::outputs::{differences, tree};
 use crate::space::{Jail, jail};
 
-/// Runs a row's command with a standard output on which nothing fits: its files are there all the same.
+/// Runs a row's command with a full standard output: its files are written nevertheless.
 pub fn no_standard_output(row: &Row) {
     if !Path::new("/dev/full").exists() {
         println!("skipped: there is no /dev/full");
@@ -15,7 +15,7 @@ pub fn no_standard_output(row: &Row) {
     }
     let reference = reference(row);
     let mut wrong = vec![];
-    // The card of a network holds its command, so that its training is given as it is.
+    // The card of a network contains its command, so the arguments of a training are not changed.
     let as_it_is = row.arguments.contains("--json") || row.arguments.starts_with("train");
     let folder = prepared(row);
     let mut program = command(row, folder.path());
@@ -31,7 +31,7 @@ pub fn no_standard_output(row: &Row) {
     assert!(wrong.is_empty(), "sixfold {} > /dev/full\n{}", row.arguments, wrong.join("\n"));
 }
 
-/// Runs a row's command on a file system that may only be read.
+/// Runs a row's command on a read-only file system.
 pub fn read_only(row: &Row) {
     let Jail::Ready(wrap) = jail() else {
         println!("skipped: no file system can be mounted here");

@@ -75,15 +75,15 @@ struct Row {
     object: String,
     number: u64,
     method: String,
-    /// How the first try ended.
+    /// Outcome of the first try.
     ending: String,
     /// Tries that held.
     held: usize,
-    /// Whether the object came to rest: else it was no attempt.
+    /// Whether the object came to rest; otherwise the row does not count as an attempt.
     counts: bool,
     /// Distance of the nearest experience's feature.
     nearest: Option<f64>,
-    /// Candidates of geometry and of experience.
+    /// Number of candidates from geometry and from experience.
     candidates: (usize, usize),
     /// Whether the tried grasp was one transferred from experience.
     transferred: bool,
@@ -107,7 +107,7 @@ struct Recorded<'a> {
     mass: f64,
 }
 
-/// What came out.
+/// The result of the comparison.
 #[derive(Serialize)]
 pub(crate) struct Whole {
     hard: bool,
@@ -127,7 +127,7 @@ pub(crate) struct Class {
     pub trials: usize,
     /// In the order of the methods.
     pub rates: [f64; METHODS.len()],
-    /// Wilson, 95 %.
+    /// Wilson intervals, 95 %.
     pub intervals: [(f64, f64); METHODS.len()],
 }
 
@@ -143,7 +143,7 @@ pub(crate) fn run(a: &CompareArguments) -> Result<Outcome> {
     })
 }
 
-/// Compares, or continues comparing.
+/// Runs the comparison, or resumes it.
 pub(crate) fn compare(a: &CompareArguments) -> Result<Whole> {
     if a.trials == 0 {
         bail!("--trials: found 0, expected at least 1");
@@ -269,7 +269,7 @@ impl Scenes<'_> {
         Ok(out)
     }
 
-    /// Tries a method's first grasp as often as was asked for.
+    /// Tries a method's first grasp the requested number of times.
     fn attempt(
         &self,
         row: &mut Row,

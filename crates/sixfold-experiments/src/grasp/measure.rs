@@ -119,7 +119,7 @@ struct Class {
     trials: usize,
     successes: usize,
     rate: f64,
-    /// Wilson, 95 %.
+    /// Wilson interval, 95 %.
     interval: (f64, f64),
     endings: BTreeMap<String, usize>,
     median_planning_seconds: f64,
@@ -167,7 +167,7 @@ impl Tried {
         }
     }
 
-    /// The object that did not come to rest was no attempt of the planner.
+    /// If the object did not come to rest, the attempt does not count.
     fn counts(&self) -> bool {
         self.ending != AttemptOutcome::NoRest
     }

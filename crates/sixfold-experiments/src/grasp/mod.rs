@@ -1,4 +1,4 @@
-//! `sixfold grasp compare` and `sixfold grasp measure`: grasps tried in simulation, many times.
+//! `sixfold grasp compare` and `sixfold grasp measure`: repeated trials of grasps in simulation.
 
 pub(crate) mod compare;
 mod measure;

@@ -1,7 +1,7 @@
 //! Eleven ways to choose the grasp: the planner alone; experience alone (equation 6.6); the network alone and joined with the planner,
 //! both as published (section 6.3.2); the planner's grasps by quality and by the fraction of experience that agrees; the planner's
-//! grasps by what came of earlier attempts; the grasps of both kinds by that; and the planners GPD and HAF, each alone and joined with
-//! the network as published.
+//! grasps by the outcomes of earlier attempts; the grasps of both kinds by these outcomes; and the planners GPD and HAF, each alone
+//! and joined with the network as published.
 
 use std::time::Instant;
 
@@ -32,26 +32,26 @@ pub(crate) const METHODS: [&str; 11] = [
     "haf published",
 ];
 
-/// What the methods stand on.
+/// The data that the methods use.
 pub(super) struct Ways<'a> {
-    /// The gripper as it is known.
+    /// The nominal gripper.
     pub gripper: &'a Gripper,
     pub network: &'a DgcmModel,
     /// GPD and HAF.
     pub planners: &'a [Planner; 2],
 }
 
-/// What all methods say of one view.
+/// The results of all methods on one view.
 pub(super) struct Answers {
     /// Each method's grasps, the best first, and the seconds that it took.
     pub ranked: [(Vec<Ranked>, f64); METHODS.len()],
     /// Distance of the nearest experience's feature.
     pub nearest: Option<f64>,
-    /// Candidates of geometry and of experience.
+    /// Number of candidates from geometry and from experience.
     pub candidates: (usize, usize),
 }
 
-/// What was made, and in how many seconds.
+/// The result of `make` and the seconds it took.
 fn timed<T, E>(make: impl FnOnce() -> Result<T, E>) -> Result<(T, f64), E> {
     let began = Instant::now();
     Ok((make()?, began.elapsed().as_secs_f64()))
@@ -101,7 +101,7 @@ impl Ways<'_> {
     }
 }
 
-/// The grasps of a planner that learned, alone.
+/// The grasps of a trained planner alone.
 fn in_own_order(planner: &Planner, grasps: &[ScoredGrasp]) -> Vec<Ranked> {
     let ranked = |c: GraspCluster| Ranked {
         grasp: c.best,

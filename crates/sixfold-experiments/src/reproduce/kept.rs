@@ -1,4 +1,4 @@
-//! What long measurements keep in their folder: rows as they are made, and what they were made from.
+//! The files of long measurements: rows as they are made, and the inputs they were made from.
 
 use std::path::Path;
 
@@ -7,7 +7,7 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use sixfold_shell::output::write_atomically;
 
-/// The row of an earlier run, or a new one, which is kept.
+/// The stored row of an earlier run, or a new one, which is stored.
 pub(super) fn kept_or_made<T: Serialize + DeserializeOwned>(
     folder: &Path,
     key: &str,
@@ -22,11 +22,11 @@ pub(super) fn kept_or_made<T: Serialize + DeserializeOwned>(
     eprintln!("row {key}");
     let text = serde_json::to_string_pretty(&make()?)?;
     write_atomically(&path, text.as_bytes())?;
-    // As a later run will read it: numbers as text may lose their last digit.
+    // Read it back as a later run will: numbers as text may lose their last digit.
     serde_json::from_str(&text).with_context(|| format!("row {key}"))
 }
 
-/// An error if the folder holds rows of something else.
+/// An error if the folder contains rows from other inputs.
 pub(super) fn same_inputs(folder: &Path, inputs: &impl Serialize) -> Result<()> {
     let path = folder.join("inputs.json");
     let now = serde_json::to_value(inputs)?;

@@ -1,4 +1,4 @@
-//! `sixfold reproduce`: a method measured on a dataset as its paper does, with its ablations, one table from one command.
+//! `sixfold reproduce`: a method measured on a dataset as in its paper, with its ablations: one table from one command.
 
 mod auto;
 mod dgcm;

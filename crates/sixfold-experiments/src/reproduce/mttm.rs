@@ -1,7 +1,7 @@
-//! `sixfold reproduce mttm`: masks and poses of template matching per object, next to its ablations and to point pair features
-//! on the same images (dissertation, tables 5.1 and 5.2).
+//! `sixfold reproduce mttm`: masks and poses of template matching per object, compared with its ablations and with point pair
+//! features on the same images (dissertation, tables 5.1 and 5.2).
 //!
-//! Every image's outcomes are kept in `images/`, so an interrupted run continues where it was.
+//! The results of every image are stored in `images/`, so that an interrupted run can be resumed.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -57,7 +57,7 @@ pub(crate) struct ReproduceMttmArguments {
     pub no_ppf: bool,
 }
 
-/// Pixels whose depth lies this near to the drawn truth are the object's, metres (dissertation, section 5.3.2).
+/// Pixels whose depth is this close to the rendered ground truth belong to the object, metres (dissertation, section 5.3.2).
 const TRUTH_DEPTH: f32 = 0.02;
 
 /// A row of the table.
@@ -85,7 +85,7 @@ const fn way(key: &'static str, title: &'static str, by: MatchedBy) -> Way {
     }
 }
 
-/// Ways of template matching, the default first.
+/// Variants of template matching, the default first.
 const WAYS: [Way; 11] = [
     way("both", "points and network, aligned, verified with the mesh (default)", MatchedBy::Both),
     Way {
@@ -139,20 +139,20 @@ const WAYS: [Way; 11] = [
 /// The row of another method.
 const PPF: (&str, &str) = ("ppf", "point pair features");
 
-/// What was measured of one target in one way.
+/// The measurement of one target with one variant.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 struct Outcomes {
     object: u32,
-    /// Intersection over union of the mask and the visible truth, where there is a mask.
+    /// Intersection over union of the mask and the visible ground truth, if there is a mask.
     iou: Option<f64>,
-    /// ADD (ADI for symmetric objects) as a fraction of the diameter; none when nothing was found.
+    /// ADD (ADI for symmetric objects) as a fraction of the diameter; `None` when nothing was found.
     error: Option<f64>,
     confidence: Option<f64>,
     /// Seconds until hypotheses, and in verification.
     seconds: [f64; 2],
 }
 
-/// One image: outcomes by row.
+/// One image: results by row.
 type Measured = BTreeMap<String, Vec<Outcomes>>;
 
 #[derive(Debug, Clone, Serialize)]
@@ -170,7 +170,7 @@ struct Row {
     title: &'static str,
     all: Score,
     objects: BTreeMap<u32, Score>,
-    /// Mean seconds an image, all of its objects: until hypotheses, and of verification.
+    /// Mean seconds per image for all of its objects: until hypotheses, and in verification.
     seconds: [f64; 2],
 }
 
@@ -179,11 +179,11 @@ struct Whole {
     dataset: String,
     images: usize,
     rows: Vec<Row>,
-    /// What the dissertation reports, trained on these objects, real depth; not measured here.
+    /// Values from the dissertation, trained on these objects, with real depth; not measured here.
     literature: BTreeMap<&'static str, f64>,
 }
 
-/// What outcomes depend on.
+/// The inputs on which results depend.
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
 struct Inputs {
     version: String,
@@ -288,7 +288,7 @@ pub(crate) fn run(a: &ReproduceMttmArguments, json: &JsonArguments) -> Result<Ou
     Ok(if any { Outcome::Found } else { Outcome::NothingFound })
 }
 
-/// An error if the folder holds images measured with something else.
+/// An error if the folder contains images measured with other inputs.
 fn same_inputs(folder: &Path, inputs: &Inputs) -> Result<()> {
     let path = folder.join("inputs.json");
     if let Ok(text) = std::fs::read_to_string(&path) {
@@ -311,7 +311,7 @@ fn know(dataset: &BopDataset, id: u32, model: &Arc<MttmModel>) -> Result<Known> 
         .models_info(Models::Rendering)?
         .and_then(|all| all.0.get(&id).cloned())
         .unwrap_or_else(|| ModelInfo::of_mesh(&mesh));
-    // Where `sixfold estimate` keeps what it derives from a mesh, too.
+    // The folder in which `sixfold estimate` keeps derived data too.
     let folder = Cache::of_user().of_mesh(&mesh, &info)?;
     let object = Object { folder, ..Object::of_mesh(format!("object {id}"), mesh.clone(), info.clone()) };
     let templates = MttmEstimator { network: Some(model.clone()), ..MttmEstimator::default() };
@@ -339,13 +339,13 @@ fn measure(
 ) -> Result<Measured> {
     let scene = DepthRegion::from_depth(depth, camera, None, &DepthOptions::default())?;
     let mut measured = Measured::new();
-    // Each way by itself, so that times are its own.
+    // Each variant separately, so that times are not shared.
     let searches: Vec<Search<'_>> = WAYS.iter().map(|_| Search::new(&scene)).collect();
     for id in ids {
         let (Some(k), Some(truths)) = (known.get(id), truths.get(id)) else { continue };
         let instances: Vec<Vec<bool>> =
             truths.iter().map(|truth| visible(&render_depth(&k.mesh, truth, camera), depth)).collect();
-        // Of several instances any may be found.
+        // With several instances, any of them may be found.
         let error = |pose: &Pose| {
             truths.iter().map(|t| pose_error(&k.points, &k.info, t, pose)).fold(f64::INFINITY, f64::min)
         };
@@ -387,18 +387,18 @@ fn measure(
     Ok(measured)
 }
 
-/// ADD, or ADI for symmetric objects, of the vertices that `sixfold eval` takes, as a fraction of the diameter.
+/// ADD, or ADI for symmetric objects, of the vertices that `sixfold eval` uses, as a fraction of the diameter.
 fn pose_error(points: &ModelPoints, info: &ModelInfo, truth: &Pose, found: &Pose) -> f64 {
     add_s(points, info.is_symmetric(), found, truth) / info.diameter
 }
 
-/// Which pixels a rendered instance is seen at.
+/// The pixels at which a rendered instance is visible.
 fn visible(rendered: &DepthImage, depth: &DepthImage) -> Vec<bool> {
     let pairs = rendered.as_slice().iter().zip(depth.as_slice());
     pairs.map(|(z, seen)| *z > 0.0 && *seen > 0.0 && (z - seen).abs() < TRUTH_DEPTH).collect()
 }
 
-/// Intersection over union of a mask and what is visible.
+/// Intersection over union of a mask and the visible pixels.
 fn overlap(mask: &[u32], visible: &[bool]) -> f64 {
     let truth = visible.iter().filter(|v| **v).count();
     let common = mask.iter().filter(|p| visible.get(**p as usize) == Some(&true)).count();

@@ -1,5 +1,5 @@
-//! `sixfold reproduce teach`: objects taught from simulated photographs, held against their truth: poses of the camera, mesh,
-//! symmetries, and the taught object found again among others in new depth images.
+//! `sixfold reproduce teach`: objects taught from simulated photographs and compared with the ground truth: camera poses, mesh and
+//! symmetries, and the search for the taught object among others in new depth images.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -30,11 +30,11 @@ pub(super) const AFTER_HELP: &str = "Example:\n  \
     sixfold reproduce teach --list benches/teach-objects.json --meshes DIR --ground photograph.jpg --out out/reproduce-teach\n\n\
     Every object is kept. After a stop, the same command resumes.";
 
-/// Distance of colours between neighbouring places of a mesh without colours, 1/m: patches of a few centimetres.
+/// Angular spatial frequency of the colours given to a mesh without colours, 1/m: patches of a few centimetres.
 const PATCHES: f64 = 90.0;
 /// New images of each object.
 const NEW_IMAGES: usize = 5;
-/// Side of the cloth in place of a board, metres.
+/// Side of the cloth that replaces the board, metres.
 const CLOTH: f64 = 0.6;
 /// A pose is right within this fraction of the diameter.
 const RIGHT: f64 = 0.1;
@@ -88,22 +88,22 @@ struct Row {
     camera_mm: f64,
     camera_deg: f64,
     mask_iou: f64,
-    /// Mean distance of the mesh to the truth, and of what the photographs show of the truth to the mesh.
+    /// Mean distance of the mesh to the true mesh, and of the photographed part of the true mesh to the mesh.
     mesh_mm: f64,
     truth_mm: f64,
     with_depth: f64,
-    /// Axes and rotations that are sure, found and true.
+    /// Number of sure axes and rotations: found, and true.
     symmetries: [usize; 2],
     symmetries_true: [usize; 2],
-    /// By point pair features in depth alone.
+    /// Images in which point pair features found it, from depth alone.
     found: usize,
     images: usize,
     /// The same with the true mesh.
     found_with_true_mesh: usize,
-    /// By `auto` with depth and colour.
+    /// Images in which `auto` found it, from depth and colour.
     found_auto: usize,
     found_auto_with_true_mesh: usize,
-    /// Wrong poses among those that `auto` reports at probability 0.5.
+    /// Wrong poses among those that `auto` reports with a probability of at least 0.5.
     wrong_auto: usize,
     seconds: f64,
 }
@@ -178,7 +178,7 @@ fn kept(file: &Path, a: &ReproduceTeachArguments) -> Option<Row> {
     (row.photographs == a.photographs && row.seed == a.seed && row.no_board == a.no_board).then_some(row)
 }
 
-/// A mesh with colours: smooth patches where it has none.
+/// A mesh with colours: smooth patches if it has none.
 fn colored(mesh: Mesh) -> Mesh {
     if mesh.texture().is_some() || mesh.colors().is_some() {
         return mesh;
@@ -221,7 +221,7 @@ fn measured(
     let facts = teaching.shape().context("no mesh was made")?;
     let rows = facts.board_from_object;
     let world_from_taught = Pose::from_translation(Vec3::new(rows[0][3], rows[1][3], rows[2][3]));
-    // Without a board the world's frame is another one: that in which the cameras stand best where they were.
+    // Without a board the world's frame is arbitrary: align the cameras with their true poses.
     let board_from_world = if a.no_board { board_from_world(&teaching, &capture)? } else { Pose::identity() };
     let board_from_taught = compose(&board_from_world, &world_from_taught);
     let errors = errors(&teaching, &capture, &board_from_world)?;
@@ -273,7 +273,7 @@ pub(super) fn compose(a: &Pose, b: &Pose) -> Pose {
     Pose::new(a.rotation() * b.rotation(), a.transform_point(&b.translation()))
 }
 
-/// Points of the true surface that a photograph shows.
+/// Points of the true surface that are visible in a photograph.
 fn seen_points(there: &Mesh, capture: &SimulatedCapture<'_>, camera: &Camera) -> Vec<Vec3> {
     let points = there.sample_surface(30_000, 2).points;
     let camera = camera.without_distortion();
@@ -290,14 +290,15 @@ fn seen_points(there: &Mesh, capture: &SimulatedCapture<'_>, camera: &Camera) ->
     points.into_iter().zip(seen).filter(|(_, seen)| *seen).map(|(p, _)| p).collect()
 }
 
-/// Mean distance of points from the nearest of others, millimetres.
+/// Mean distance of points to their nearest neighbours among other points, millimetres.
 pub(super) fn mean_millimetres<'a>(from: impl Iterator<Item = &'a Vec3>, to: &[Vec3]) -> f64 {
     let tree = KdTree::new(to);
     let all: Vec<f64> = from.filter_map(|p| tree.nearest(p)).map(|n| n.distance).collect();
     1000.0 * all.iter().sum::<f64>() / all.len().max(1) as f64
 }
 
-/// Mean distances in millimetres: of the mesh where it is above the sheet to the truth, and of the truth where it is seen to the mesh.
+/// Mean distances in millimetres: of the mesh above the sheet to the true mesh, and of the visible part of the true mesh to the
+/// mesh.
 fn distances(found: &Mesh, there: &Mesh, seen: &[Vec3]) -> [f64; 2] {
     let (found, truth) = (found.sample_surface(100_000, 1).points, there.sample_surface(100_000, 3).points);
     let above = found.iter().filter(|p| p.z > 0.003);
@@ -314,8 +315,8 @@ struct NewScenes<'a> {
 }
 
 impl NewScenes<'_> {
-    /// In how many of them a method's best pose of an object is right, and in how many wrong although its confidence is 0.5 or more.
-    /// `known_from_true` takes points of the true mesh to the known object's frame.
+    /// The number of images in which a method's best pose of an object is right, and the number in which it is wrong with a
+    /// confidence of 0.5 or more. `known_from_true` takes points of the true mesh to the known object's frame.
     fn found(
         &self,
         estimator: &dyn PoseEstimator,
@@ -358,7 +359,7 @@ impl NewScenes<'_> {
         };
         let mut placed = vec![(self.mesh, upright(turn, 0.0, 0.0, self.mesh))];
         for (k, other) in self.others.iter().enumerate() {
-            // Beside the object, nearly touching: one before it, one behind.
+            // Two neighbours nearly touching the object: one in front of it, one behind.
             let apart = 0.85 * (radius(self.mesh) + radius(other));
             let angle = turn * 0.7 + if k == 0 { 0.4 } else { 3.6 };
             placed.push((*other, upright(2.0 * turn, apart * angle.cos(), apart * angle.sin(), other)));
@@ -396,7 +397,7 @@ struct NewImage {
     camera: Camera,
     depth: DepthImage,
     rgb: RgbImage,
-    /// Of the object.
+    /// True pose of the object.
     truth: Pose,
 }
 

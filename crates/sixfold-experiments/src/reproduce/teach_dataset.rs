@@ -1,5 +1,5 @@
 //! `sixfold reproduce teach-dataset`: objects of a BOP dataset taught from a few of its real images, with annotated poses and masks
-//! and without their meshes, held against these meshes; and found in the other images.
+//! and without their meshes, then compared with these meshes and searched in the other images.
 
 use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
@@ -29,14 +29,15 @@ pub(super) const AFTER_HELP: &str = "Example:\n  \
     sixfold reproduce teach-dataset --dataset lmo --objects 5 6 8 9 12 --out out/reproduce-teach-dataset\n\n\
     Every object is kept. After a stop, the same command resumes.";
 
-/// An object of which less is visible is not searched in an image, as in the BOP Challenge.
+/// Minimum visible fraction of an object that is searched in an image, as in the BOP Challenge.
 const VISIBLE_TO_FIND: f64 = 0.1;
 /// Points of each other object that stands on the board.
 const BODY_POINTS: usize = 3000;
 /// Steps of the search for the board's normal, as tangents of the angle: it is within 45 degrees of the camera's direction.
 const FIRST_STEP: f64 = 1.0;
 const LAST_STEP: f64 = 0.001;
-/// Fewest other objects that say a plane, and the largest mean deviation of their lowest points from it, metres. Chosen by hand.
+/// Minimum number of other objects for a plane, and the largest mean deviation of their lowest points from it, metres.
+/// Chosen by hand.
 const FEWEST_BODIES: usize = 4;
 const BELOW: f64 = 0.006;
 /// A pose is right within this fraction of the diameter (Hinterstoisser et al. 2012).
@@ -67,7 +68,7 @@ pub(crate) struct TeachDatasetArguments {
     out: PathBuf,
 }
 
-/// What a row depends on.
+/// The inputs of a row.
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
 struct Asked {
     photographs: usize,
@@ -89,7 +90,7 @@ struct Row {
     /// Images that taught it, as scene/image.
     taught_from: Vec<String>,
     diameter_mm: f64,
-    /// Mean distance of the taught mesh to the true one, and of what the images show of the true one to the taught one.
+    /// Mean distance of the taught mesh to the true mesh, and of the visible part of the true mesh to the taught mesh.
     mesh_mm: f64,
     truth_mm: f64,
     /// Fraction of the taught surface that no image shows.
@@ -117,7 +118,7 @@ struct Seen {
     camera: Camera,
     pose: Pose,
     visible: Mask,
-    /// Where other annotated objects are.
+    /// The pixels of other annotated objects.
     others: Mask,
     info: GroundTruthInfo,
 }
@@ -127,7 +128,7 @@ impl Seen {
         format!("{:06}/{:06}", self.scene, self.image)
     }
 
-    /// From where the camera looks, in the object's frame.
+    /// The viewing direction in the object's frame.
     fn direction(&self) -> Vec3 {
         self.pose.inverse().translation().normalize()
     }
@@ -218,7 +219,7 @@ fn seen(scenes: &[Scene], id: u32, meshes: &BTreeMap<u32, Mesh>) -> Result<Vec<S
     Ok(all)
 }
 
-/// Images from as different sides as there are: each the one farthest from those before.
+/// Images from different sides: each is the one whose direction is farthest from those chosen before.
 fn chosen(seen: &[Seen], most: usize, visible: f64) -> Vec<usize> {
     let good: Vec<usize> = (0..seen.len()).filter(|i| seen[*i].info.visib_fract >= visible).collect();
     let Some(first) =
@@ -248,7 +249,7 @@ fn image_file(scenes: &[Scene], seen: &Seen) -> Result<PathBuf> {
         .with_context(|| format!("{}: found no colour image", seen.name()))
 }
 
-/// Writes what `sixfold teach` reads: poses, masks and the images' paths.
+/// Writes the input of `sixfold teach`: poses, masks and the images' paths.
 fn photograph_file(
     folder: &Path,
     scenes: &[Scene],
@@ -335,8 +336,8 @@ fn measured(
     })
 }
 
-/// Where is up in the object's frame: the normal of the plane on which the other annotated objects of each image stand, as a printed
-/// board would say it; the median of the images. The object's true mesh is not used.
+/// The up direction in the object's frame, which a printed board would give: the normal of the plane on which the other annotated
+/// objects of each image stand, as the median over the images. The object's true mesh is not used.
 fn up(scenes: &[Scene], id: u32, used: &[&Seen], meshes: &BTreeMap<u32, Mesh>) -> Result<Option<FloorEntry>> {
     let points: BTreeMap<u32, Vec<Vec3>> =
         meshes.iter().map(|(id, mesh)| (*id, mesh.sample_surface(BODY_POINTS, 7).points)).collect();
@@ -362,7 +363,7 @@ fn standing_plane(bodies: &[Vec<Vec3>], eye: &Vec3) -> Option<Plane> {
     let lowest = |normal: &Vec3| -> Vec<f64> {
         bodies.iter().map(|body| body.iter().map(|p| normal.dot(p)).fold(f64::INFINITY, f64::min)).collect()
     };
-    // The mean distance from the median: one body may stand on another.
+    // The mean distance from the median, because one body may stand on another.
     let spread = |normal: &Vec3| {
         let mut heights = lowest(normal);
         let middle = median(&mut heights).unwrap_or(f64::NAN);
@@ -383,9 +384,9 @@ fn standing_plane(bodies: &[Vec<Vec3>], eye: &Vec3) -> Option<Plane> {
     (bodies.len() >= FEWEST_BODIES && error < BELOW).then_some(Plane { normal: best, offset })
 }
 
-/// Mean distances in millimetres: of the found mesh to the truth, and of the truth where an image shows it to the found mesh.
+/// Mean distances in millimetres: of the found mesh to the true mesh, and of the visible part of the true mesh to the found mesh.
 fn distances(found: &Mesh, truth: &Mesh, used: &[&Seen]) -> [f64; 2] {
-    /// How far behind the rendered surface a point is still seen, metres.
+    /// How far behind the rendered surface a point still counts as visible, metres.
     const BEHIND: f64 = 0.0015;
     let points = truth.sample_surface(30_000, 2).points;
     let mut is_seen = vec![false; points.len()];
@@ -409,15 +410,15 @@ fn distances(found: &Mesh, truth: &Mesh, used: &[&Seen]) -> [f64; 2] {
 struct Search<'a> {
     mesh: &'a Mesh,
     symmetric: bool,
-    /// Metres.
+    /// The object's diameter, metres.
     diameter: f64,
     scenes: &'a [Scene],
     images: &'a [&'a Seen],
 }
 
 impl Search<'_> {
-    /// In how many images the best pose in the ground truth's box is right. `known_from_true` takes points of the true mesh to the
-    /// known object's frame.
+    /// The number of images in which the best pose in the ground truth's box is right. `known_from_true` takes points of the true
+    /// mesh to the known object's frame.
     fn right(&self, estimator: &dyn PoseEstimator, known: &Object, known_from_true: &Pose) -> Result<usize> {
         let prepared = estimator.prepare(known)?;
         let points = ModelPoints::new(&self.mesh.sample_surface(2000, 5).points).context("no points")?;

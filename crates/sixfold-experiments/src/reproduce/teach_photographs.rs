@@ -1,4 +1,4 @@
-//! Simulated photographs of an object, what is taught from them, and the errors of poses and masks.
+//! Simulated photographs of an object, the teaching from them, and the errors of poses and masks.
 
 use std::path::Path;
 
@@ -21,7 +21,7 @@ pub(super) fn write_photographs(capture: &SimulatedCapture<'_>, files: &Path) ->
     Ok(())
 }
 
-/// The object taught from them: on the board, or without one where a length is given.
+/// The object taught from them: on the board, or without one if a length is given.
 pub(super) fn teaching(files: &Path, photographs: usize, length: Option<KnownLength>) -> Result<Teaching> {
     let world = if length.is_some() { World::Features } else { World::Board };
     let options = TeachOptions { world, ..TeachOptions::default() };
@@ -89,7 +89,7 @@ pub(super) fn marked_length(capture: &SimulatedCapture<'_>, camera: &Camera, see
     KnownLength { metres: (first - second).norm(), ends: [0, third, 2 * third].map(&mut marked).to_vec() }
 }
 
-/// The motion (without a change of scale) that puts the cameras best where they were.
+/// The rigid motion (without scale) that best aligns the cameras with their true poses.
 pub(super) fn board_from_world(teaching: &Teaching, capture: &SimulatedCapture<'_>) -> Result<Pose> {
     let both = capture.camera_from_board.iter().enumerate().filter_map(|(i, truth)| {
         Some((teaching.camera_from_board(i)?.inverse().translation(), truth.inverse().translation()))

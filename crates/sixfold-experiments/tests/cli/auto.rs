@@ -17,10 +17,10 @@ fn probabilities_are_fitted_checked_and_kept() {
     for file in ["table.md", "reproduce.json", "reliability.png"] {
         assert!(dir.join("fit").join(file).is_file(), "{file}");
     }
-    // Kept images are not searched again: the same times.
+    // Stored images are not searched again, so the times are the same.
     assert_eq!(sixfold(dir, fit).expect(0).json(), fitted);
 
-    // By the fitted file, with an object that no image shows.
+    // With the fitted file, and with an object that no image shows.
     let mesh = tiny.file("models/obj_000001.ply");
     std::fs::copy(mesh, dir.join("stranger.ply")).unwrap();
     let check =

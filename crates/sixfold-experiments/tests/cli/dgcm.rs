@@ -17,12 +17,14 @@ fn the_tables_of_chapter_6_are_made_and_kept() {
     .unwrap();
     let command = format!("reproduce dgcm --list objects.json --weights {NETWORK} --quick --out out --json");
     let json = sixfold(dir, &command).expect(0).json();
-    // Table 6.2: one scene for each way to choose a grasp, the published ones among them; rates of four tries.
+    // Table 6.2: one scene for each method of choosing a grasp, including the published ones; rates of four
+    // tries.
     let class = &json["compare"]["classes"][0];
     let rates: Vec<f64> = class["rates"].as_array().unwrap().iter().map(|r| r.as_f64().unwrap()).collect();
     assert_eq!((rates.len(), &class["class"]), (11, &"part".into()));
     assert!(rates.iter().all(|r| (4.0 * r).fract() == 0.0 && (0.0..=1.0).contains(r)), "{rates:?}");
-    // Figure 6.7: of its own class and of all, for each number of experiences; with one object they are the same.
+    // Figure 6.7: experience of the same class and of all classes, for each number of experiences; with one
+    // object they are the same.
     let curves = json["curves"].as_array().unwrap();
     assert_eq!(curves.len(), 8, "{curves:?}");
     assert!(curves.iter().all(|c| c["asked"].as_u64().unwrap() > 0), "{curves:?}");
@@ -40,7 +42,7 @@ fn the_tables_of_chapter_6_are_made_and_kept() {
     for file in ["experience-5cm.png", "between-objects-1cm.png", "incremental.png", "reproduce.json"] {
         assert!(dir.join("out").join(file).is_file(), "{file}");
     }
-    // Again, everything is there.
+    // Run again: everything exists already.
     let trials = std::fs::read(dir.join("out/compare/trials.jsonl")).unwrap();
     let again = sixfold(dir, &command).expect(0).json();
     assert_eq!(

@@ -46,7 +46,7 @@ fn objects_of_a_list_have_units_of_their_own() {
         refused("--unit mm");
         refused("--store objects");
     }
-    // A synthetic object, the same each time; half of one is none.
+    // A synthetic object, the same each time; an incomplete entry is refused.
     let list = |text: &str| std::fs::write(dir.path().join("l.json"), text).unwrap();
     list(r#"[{"class": "cup", "synthetic": {"family": "cup", "number": 1}}]"#);
     let measure = "grasp measure --list l.json --trials 1 --json";

@@ -13,5 +13,5 @@ mod pix2pose;
 #[path = "../../../sixfold-cli/tests/cli/support.rs"]
 mod support;
 
-/// What is tested.
+/// The program under test.
 const PROGRAM: &str = env!("CARGO_BIN_EXE_sixfold-experiments");

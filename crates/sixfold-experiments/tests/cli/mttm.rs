@@ -27,8 +27,8 @@ fn a_dataset_is_reproduced_and_it_goes_on() {
     assert!(whole["rows"][0]["all"]["iou"].as_f64().unwrap() > 0.6, "{whole}");
     let table = std::fs::read_to_string(dir.join("reproduced/table.md")).unwrap();
     assert!(table.contains("point pair features"), "{table}");
-    // Kept images are not measured again, so the second run gives the same times, but for the last digit, which reading
-    // numbers as text may cost.
+    // Stored images are not measured again, so the second run gives the same times, except for the last digit, which may change
+    // when numbers are read as text.
     let mut again = sixfold(dir, reproduce).expect(0).json();
     for (row, before) in
         again["rows"].as_array_mut().unwrap().iter_mut().zip(whole["rows"].as_array().unwrap())
@@ -39,7 +39,7 @@ fn a_dataset_is_reproduced_and_it_goes_on() {
         row["seconds"] = before["seconds"].clone();
     }
     assert_eq!(again, whole);
-    // Another instance of an object in the ground truth, listed last and nowhere to be seen: what was found before still counts.
+    // Another instance of an object in the ground truth, listed last and not visible: the objects found before still count.
     let file = tiny.file("test/000007/scene_gt.json");
     let mut truth: serde_json::Value = serde_json::from_slice(&std::fs::read(&file).unwrap()).unwrap();
     for poses in truth.as_object_mut().unwrap().values_mut() {

@@ -15,7 +15,7 @@ fn the_tables_of_neural_object_learning_are_made_and_kept() {
     assert_eq!(poses.len(), 6, "{whole}");
     let of = |k: usize, field: &str| poses[k]["all"][field].as_f64().unwrap();
     assert!(of(5, "millimetres") < of(4, "millimetres") && poses[5]["all"]["improved"].is_null(), "{whole}");
-    // The same disturbances on frames rendered again, whose light and background are others.
+    // The same disturbances on rendered frames, with other light and backgrounds.
     let drawn = whole["drawn_poses"].as_array().unwrap();
     let of_rendered = |k: usize| drawn[k]["all"]["millimetres"].as_f64().unwrap();
     assert_eq!(of_rendered(0), of(0, "millimetres"), "{whole}");
@@ -25,7 +25,8 @@ fn the_tables_of_neural_object_learning_are_made_and_kept() {
     assert!(of(4, "millimetres") < of(0, "millimetres"), "{whole}");
     assert_eq!(whole["targets_of_views"][0], 2, "{whole}");
     let views = whole["views"].as_array().unwrap();
-    // Plain texturing and averaging: from three sets of poses, one of them judged too, and with two wrong meshes.
+    // Plain texturing and averaging: from three sets of poses, one of them also with contradicted pixels removed, and
+    // with two wrong meshes.
     assert_eq!(views.len(), 12, "{whole}");
     for view in views {
         assert!(view["plain"]["psnr"].as_f64().unwrap() > 10.0, "{view}");
@@ -37,11 +38,11 @@ fn the_tables_of_neural_object_learning_are_made_and_kept() {
     for picture in ["views.png", "geometry.png", "drawn.png"] {
         assert!(dir.join("reproduced").join(picture).is_file(), "{picture}");
     }
-    // Kept rows are not made again: nor is the time that they took.
+    // Stored rows are not made again, and their times are kept.
     let again = sixfold(dir, reproduce).expect(0);
     assert_eq!(again.json(), whole);
     assert!(!again.stderr.contains("row "), "{}", again.stderr);
-    // Without --quick the rows stay, and others are added.
+    // Without --quick the rows are kept and others are added.
     let more = sixfold(dir, &reproduce.replace(" --quick", "")).expect(0);
     assert!(more.stderr.contains("row poses-both-2") && !more.stderr.contains("row poses-both-0"));
     fails(dir, &format!("{reproduce} --seed 1"), &["reproduced", "other inputs", "seed"]);

@@ -16,7 +16,7 @@ fn the_table_is_made_row_by_row() {
     let run = sixfold(tiny.path(), &format!("{command} --json"));
     assert!(run.code == 0 || run.code == 1, "{}", run.stderr);
     let json = run.json();
-    // Object 1 in the one frame that was not trained on; the model does not know object 2.
+    // Object 1 in the only frame that was not used for training; the model was not trained on object 2.
     assert_eq!((&json["frames"], &json["targets"]), (&1.into(), &1.into()));
     let rows = json["rows"].as_array().unwrap();
     let keys: Vec<&str> = rows.iter().map(|r| r["key"].as_str().unwrap()).collect();
@@ -40,7 +40,7 @@ fn the_table_is_made_row_by_row() {
     let table = std::fs::read_to_string(tiny.path().join("table/table.md")).unwrap();
     assert!(table.contains("| 1.000 | 1.000 | 1.000 |") && table.contains("0.320"), "{table}");
 
-    // What is there is not made again, what is missing is.
+    // Existing rows are not made again; missing ones are.
     let edited = tiny.path().join("table/rows/one-stage.json");
     replace(&edited, "\"one stage, PnP\"", "\"kept from before\"");
     std::fs::remove_file(tiny.path().join("table/rows/noise-20.json")).unwrap();
@@ -49,7 +49,7 @@ fn the_table_is_made_row_by_row() {
     assert!(run.stderr.contains("row noise-20") && !run.stderr.contains("row default"), "{}", run.stderr);
 
     fails(tiny.path(), &format!("{command} --quick"), &["table", "quick was false, is true"]);
-    // Frames that the network has seen are no test.
+    // Training frames cannot be used as tests.
     std::fs::write(tiny.path().join("wrong.json"), "[{\"scene_id\": 7, \"im_id\": 0}]").unwrap();
     let wrong = command.replace("frames.json", "wrong.json").replace("--out table", "--out other");
     fails(tiny.path(), &wrong, &["7/11", "wrong.json"]);
@@ -77,7 +77,7 @@ fn the_trainings_of_the_ablations_are_made_scored_and_kept() {
     // The part has no symmetry: nothing is trained for those, and the reason is reported.
     assert!(row("trained-transformer-loss").is_none());
     assert!(run.stderr.contains("trained-plain-l1-2: the model has no such object"), "{}", run.stderr);
-    // Each with a network and a row of its own, on the frame that was not trained on.
+    // Each with its own network and row, on the frame that was not used for training.
     for key in ["trained-mesh", "trained-discriminator", "trained-convex-hull", "fourfold-plain-l1"] {
         let row = row(key).unwrap_or_else(|| panic!("{key} is not in {rows:?}"));
         assert!((0.0..=1.0).contains(&row["scores"]["ar_mspd"].as_f64().unwrap()), "{row}");

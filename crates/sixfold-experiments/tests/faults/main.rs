@@ -1,6 +1,6 @@
 //! Faults put into the program as users run it, with the drivers of the program `sixfold` (crates/sixfold-cli/tests/faults): killed
-//! and run again, two at once, a full disk, a folder and a standard output that cannot be written. `docs/faults.md` says what is
-//! promised.
+//! and run again, two at once, a full disk, a folder and a standard output that cannot be written. `docs/faults.md` states the
+//! expected behaviour.
 #![cfg(unix)]
 
 #[macro_use]
@@ -27,5 +27,5 @@ mod two;
 #[path = "../../../sixfold-cli/tests/faults/unwritable.rs"]
 mod unwritable;
 
-/// What is tested.
+/// The program under test.
 const PROGRAM: &str = env!("CARGO_BIN_EXE_sixfold-experiments");

@@ -1,4 +1,4 @@
-//! What commands of experiments work with and other commands make: a store of experiences, and a trained network.
+//! Inputs of the experiments that other commands make: a store of experiences, and a trained network.
 
 use std::path::Path;
 use std::sync::atomic::AtomicBool;

@@ -1,16 +1,17 @@
 //! The pose from three points: AP3P (Ke and Roumeliotis, *An Efficient Algebraic Solution to the
 //! Perspective-Three-Point Problem*, CVPR 2017).
 //!
-//! A quartic in the cosine of one angle gives up to four poses. Taken from the paper: the quartic (its equations 28 to 41).
-//! Ours: each root is turned into the three distances along the rays, which two steps of Newton's method make exact
-//! (as Persson and Nordberg 2018, section 3.8, do), because a sine got from a cosine near 1 has lost half of its digits.
+//! A quartic in the cosine of one angle gives up to four poses. The quartic is taken from the paper (its equations 28 to
+//! 41). The rest differs: each root is converted into the three distances along the rays, which are refined by two steps of
+//! Newton's method (as in Persson and Nordberg 2018, section 3.8), because a sine computed from a cosine near 1 loses half
+//! of its digits.
 
 use super::Model;
 use crate::{Mat3, Pose, Vec3, pose::nearest_rotation};
 
-/// Up to four poses that see three points along three rays: all of `camera_from_object` for which `object_points[i]`
-/// (metres) lies on the ray from the camera's centre through `rays[i]` (any length, z forward), in front of the camera.
-/// Empty for points on one line.
+/// Up to four poses in which three points lie on three rays: all `camera_from_object` for which `object_points[i]` (metres)
+/// lies on the ray from the camera's centre through `rays[i]` (any length, z forward), in front of the camera. Empty for
+/// points on one line.
 ///
 /// ```
 /// use sixfold_geometry::{Pose, Vec3, p3p};
@@ -26,7 +27,7 @@ pub fn p3p(rays: &[Vec3; 3], object_points: &[Vec3; 3]) -> Vec<Pose> {
     models[..count].iter().map(|m| Pose::new(nearest_rotation(&m.rotation), m.translation)).collect()
 }
 
-/// As [`p3p`] for unit rays, into a fixed array; returns how many.
+/// As [`p3p`] for unit rays, into a fixed array; returns the number of poses.
 pub(super) fn ap3p(b: &[Vec3; 3], w: &[Vec3; 3], out: &mut [Model; 4]) -> usize {
     // Frames of the paper: k1 along the first side, k3 normal to the first two rays.
     let u0 = w[0] - w[1];
@@ -84,7 +85,7 @@ pub(super) fn ap3p(b: &[Vec3; 3], w: &[Vec3; 3], out: &mut [Model; 4]) -> usize 
         let sin1 = (1.0 - cos1 * cos1).sqrt().copysign(k3b3);
         let scale = sin1 / ((g5 * cos1 + g6) * cos1 + g7);
         let (cos3, sin3) = (scale * (g1 * cos1 + g2), scale * (g3 * cos1 + g4));
-        // The third point is at p3 in the camera frame; where the others are follows from the rotation.
+        // The third point is at p3 in the camera frame; the others follow from the rotation.
         let c13 =
             Mat3::new(cos3, 0.0, -sin3, sin1 * sin3, cos1, sin1 * cos3, cos1 * sin3, -sin1, cos1 * cos3);
         let turn = world * c13;
@@ -192,7 +193,7 @@ fn real_quartic_roots(c: [f64; 5], out: &mut [f64; 4]) -> usize {
     let m = largest_cubic_root(p, 0.25 * p * p - r, -0.125 * q * q);
     let mut count = 0;
     let mut add = |half: f64, discriminant: f64, scale: f64| {
-        // A double root whose discriminant rounding has pushed below zero is still a root.
+        // A double root is still a root if rounding makes its discriminant slightly negative.
         if discriminant < -1e-9 * scale {
             return;
         }
@@ -269,7 +270,7 @@ mod tests {
             let truth = Pose::exp(&[0.0, 0.0, 0.0, w[0], w[1], w[2]].into()).with_translation(Vec3::new(t.0, t.1, t.2));
             let w = points.map(Vec3::from);
             let rays = w.map(|p| truth.transform_point(&p).normalize());
-            // Triangles that are seen well: not slim, and not near the danger cylinder, on which two solutions meet.
+            // Well-conditioned triangles: not slim, and not near the danger cylinder, on which two solutions coincide.
             let normal = (w[1] - w[0]).cross(&(w[2] - w[0]));
             let longest = (w[1] - w[0]).norm().max((w[2] - w[0]).norm()).max((w[2] - w[1]).norm());
             prop_assume!(normal.norm() > 0.1 * longest * longest && longest > 0.02);
@@ -286,7 +287,7 @@ mod tests {
         }
     }
 
-    /// How far the distances are from a double solution: the determinant of their Jacobian, without unit.
+    /// How far the distances are from a double solution: the determinant of their Jacobian, dimensionless.
     fn conditioning(truth: &Pose, w: &[Vec3; 3]) -> f64 {
         let p = w.map(|q| truth.transform_point(&q));
         let b = p.map(|q| q.normalize());

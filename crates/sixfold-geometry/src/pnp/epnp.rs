@@ -1,16 +1,16 @@
 //! The pose from four or more points by EPnP (Lepetit, Moreno-Noguer and Fua, *EPnP: An Accurate O(n) Solution to the
-//! PnP Problem*, IJCV 2009): what the dissertation used inside RANSAC.
+//! PnP Problem*, IJCV 2009), which the dissertation used inside RANSAC.
 //!
 //! Points are weighted sums of four control points (three for a plane); the control points in the camera frame lie in
-//! the null space of a 12x12 matrix, whose combination follows from their distances (section 3.3, cases N = 1, 2, 3), made
-//! exact by Gauss-Newton (section 3.4).
+//! the null space of a 12x12 matrix. The combination of null vectors follows from the distances between the control points
+//! (section 3.3, cases N = 1, 2, 3) and is refined by Gauss-Newton (section 3.4).
 
 use nalgebra::{Matrix4, SMatrix, SVector, SymmetricEigen, Vector4};
 
 use super::{Model, PnpError, Prepared};
 use crate::{Camera, Mat3, Pose, Vec2, Vec3, pose::nearest_rotation};
 
-/// Points whose thickness is below this fraction of their extent are a plane.
+/// Points whose thickness is below this fraction of their extent count as planar.
 const PLANAR: f64 = 1e-4;
 
 /// The pose that EPnP finds for at least four correspondences without outliers: object points in metres, image points
@@ -66,7 +66,7 @@ pub(super) fn solve(n: usize, at: impl Fn(usize) -> (Vec3, Vec2)) -> Option<Mode
         }
     }
     if planar {
-        // The fourth control point does not exist: keep it out of the null space.
+        // There is no fourth control point: keep it out of the null space.
         let large = mtm.trace() + 1.0;
         for i in 9..12 {
             mtm[(i, i)] = large;
@@ -256,7 +256,7 @@ mod tests {
             let truth = Pose::exp(&[0.0, 0.0, 0.0, w[0], w[1], w[2]].into()).with_translation(Vec3::new(t.0, t.1, t.2));
             let points: Vec<Vec3> =
                 points.into_iter().map(|p| Vec3::new(p[0], p[1], if flat { 0.01 } else { p[2] })).collect();
-            // A plane seen from its side has no pose.
+            // The pose of a plane seen edge-on is not determined.
             prop_assume!(!flat || truth.transform_direction(&Vec3::z()).dot(&truth.translation().normalize()).abs() > 0.2);
             let pixels: Vec<Vec2> = points.iter().map(|p| camera().project(&truth.transform_point(p)).unwrap()).collect();
             let found = epnp(&points, &pixels, &camera()).unwrap();

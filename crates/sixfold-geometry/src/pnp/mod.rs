@@ -1,8 +1,8 @@
 //! The pose of an object from correspondences between its points and image points (PnP), with outliers.
 //!
 //! [`pnp_ransac`] draws samples ([`ransac`]), solves each ([`ap3p`] or [`epnp`]), and refines the best pose over all
-//! correspondences ([`refine`]). Image points are pixels of the raw image: where the camera has a distortion it is undone
-//! here, at the edge, and every error is measured in pinhole pixels.
+//! correspondences ([`refine`]). Image points are pixels of the raw image: if the camera has a distortion, it is removed first, and
+//! every error is measured in pinhole pixels.
 
 mod ap3p;
 mod epnp;
@@ -31,7 +31,7 @@ pub enum PnpError {
         /// Length of the second list.
         image_points: usize,
     },
-    /// Not enough to fix a pose.
+    /// Too few correspondences to determine a pose.
     #[error("{found} correspondences: at least 4 are needed")]
     TooFew {
         /// How many were given.
@@ -51,13 +51,13 @@ pub enum PnpError {
         /// Index of the point.
         index: usize,
     },
-    /// The points lie on one line or in one place.
+    /// The points lie on one line or at one place.
     #[error("the {what} lie on one line or in one place: they do not fix a pose")]
     Degenerate {
         /// Which points.
         what: &'static str,
     },
-    /// No pose explains more correspondences than it was made from.
+    /// No pose explains more correspondences than those of its own sample.
     #[error(
         "no pose agrees with enough correspondences: wrong correspondences, camera or unit, or too small a threshold"
     )]
@@ -72,12 +72,12 @@ pub enum PnpError {
         option: &'static str,
         /// Its value.
         found: f64,
-        /// What it should be.
+        /// The expected value.
         expected: &'static str,
     },
 }
 
-/// What turns a sample into poses.
+/// The solver that computes poses from a sample.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum PnpSolver {
     /// Three points, Ke and Roumeliotis (2017).
@@ -87,28 +87,28 @@ pub enum PnpSolver {
     Epnp,
 }
 
-/// How the pose is searched.
+/// Options of the search for a pose.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PnpOptions {
     /// A correspondence with a smaller reprojection error is an inlier, pixels.
     pub threshold_px: f64,
-    /// Most samples.
+    /// Maximum number of samples.
     pub max_iterations: usize,
-    /// Fewest samples, however good the first are.
+    /// Minimum number of samples, however good the first are.
     pub min_iterations: usize,
     /// The search ends once a sample without outliers was drawn with this probability.
     pub confidence: f64,
-    /// Seed of the samples: same input, options and seed, same bytes out.
+    /// Seed of the samples: the same input, options and seed give the same bytes.
     pub seed: u64,
-    /// What turns a sample into poses.
+    /// The solver that computes poses from a sample.
     pub solver: PnpSolver,
-    /// Most steps of the local optimisation of each new best pose; 0 for none.
+    /// Maximum number of steps of the local optimisation of each new best pose; 0 for none.
     pub local_iterations: usize,
     /// Refine the result over all correspondences.
     pub refine: bool,
-    /// The refinement ends by estimating the noise from all errors below this many thresholds, and weighting each
-    /// correspondence by how likely it is an inlier; 0 leaves the hard threshold. On noise near the threshold this
-    /// lowers the rotation error by a third.
+    /// The last step of the refinement estimates the noise from all errors below this many thresholds and weights each
+    /// correspondence by its probability of being an inlier; 0 keeps the hard threshold. On noise near the threshold this lowers
+    /// the rotation error by a third.
     pub noise_window: f64,
 }
 
@@ -154,14 +154,14 @@ impl PnpOptions {
     }
 }
 
-/// What came out.
+/// The result of the search.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PnpReport {
     /// The pose.
     pub camera_from_object: Pose,
     /// Per correspondence, whether its reprojection error is below the threshold.
     pub inliers: Vec<bool>,
-    /// How many are.
+    /// Number of inliers.
     pub inlier_count: usize,
     /// Samples drawn.
     pub iterations: usize,
@@ -209,7 +209,7 @@ pub fn pnp_ransac(
         if options.noise_window > 0.0 {
             let window_px = options.noise_window * options.threshold_px;
             let likely = refine::refine_by_mixture(&data, &pose, window_px, 15);
-            // The spread and the pose are found together; where that runs away from the support, it is not taken.
+            // Noise and pose are estimated together; if the result has much less support than before, it is discarded.
             let score = |pose: &Pose| data.report(pose, options.threshold_px, 0).score;
             if score(&likely) > 0.8 * score(&pose) {
                 pose = likely;

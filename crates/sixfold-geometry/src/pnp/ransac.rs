@@ -1,5 +1,6 @@
 //! Locally optimised RANSAC (Chum, Matas and Kittler 2003; Lebeda, Matas and Chum 2012) over the truncated cost of
-//! MSAC (Torr and Zisserman 2000), with the sequential test of Chum and Matas (2008) that drops a bad pose after few points.
+//! MSAC (Torr and Zisserman 2000), with the sequential test of Chum and Matas (2008), which rejects a bad pose after few
+//! points.
 
 use rand::{RngExt, SeedableRng, seq::SliceRandom};
 use rand_chacha::ChaCha8Rng;
@@ -9,9 +10,9 @@ use super::refine::{RefineOptions, refine};
 use super::{Model, PnpOptions, Prepared, epnp};
 use crate::{Pose, Vec2, Vec3};
 
-/// Correspondences that are judged together.
+/// Number of correspondences that are evaluated together.
 const BLOCK: usize = 32;
-/// A pose is dropped when its points are this much more likely under a wrong pose than under a good one.
+/// A pose is rejected when its residuals are this much more likely under a wrong pose than under a good one.
 const DECISION: f64 = 100.0;
 
 /// Poses from a minimal sample.
@@ -46,9 +47,9 @@ impl Kernel for EpnpKernel {
     }
 }
 
-/// What the search came to.
+/// The result of the search.
 pub(super) struct Found {
-    /// For points relative to their centroid.
+    /// The pose for points relative to their centroid.
     pub pose: Pose,
     pub iterations: usize,
 }
@@ -65,7 +66,7 @@ pub(super) fn search<K: Kernel>(data: &Prepared, options: &PnpOptions) -> Option
     };
     let mut test = SequentialTest::new();
     let mut best: Option<(f64, Pose)> = None;
-    // The best pose straight from a sample: whatever beats it is worth a local optimisation.
+    // The best pose directly from a sample: every sample that is better gets a local optimisation.
     let mut best_sampled = f32::INFINITY;
     let mut models = [Model::IDENTITY; 4];
     let mut sample = [(Vec3::zeros(), Vec2::zeros()); 8];
@@ -126,7 +127,7 @@ fn samples_needed(share: f64, size: usize, confidence: f64, most: usize) -> usiz
 }
 
 /// The likelihoods of Chum and Matas (2008): a point fits a good pose with probability `good`, a wrong one with
-/// `wrong`, which is the mean over the poses dropped so far.
+/// `wrong`, which is the mean over the poses rejected so far.
 struct SequentialTest {
     good: f64,
     wrong_inliers: f64,
@@ -139,7 +140,7 @@ impl SequentialTest {
     }
 }
 
-/// The correspondences in random order, in single precision, in blocks that the compiler turns into vector code.
+/// The correspondences in random order, in single precision, in blocks that the compiler vectorises.
 struct Blocks {
     blocks: Vec<Block>,
     count: usize,
@@ -164,7 +165,7 @@ impl Blocks {
         let blocks = order
             .chunks(BLOCK)
             .map(|chunk| {
-                // What pads the last block never fits.
+                // The padding of the last block never fits a pose.
                 let mut block = Block {
                     x: [0.0; BLOCK],
                     y: [0.0; BLOCK],
@@ -192,7 +193,8 @@ impl Blocks {
         }
     }
 
-    /// Truncated cost and number of inliers, `None` as soon as the cost must exceed `most` or the pose looks wrong.
+    /// Truncated cost and number of inliers, `None` as soon as the cost must exceed `most` or the sequential test
+    /// rejects the pose.
     fn cost(&self, model: &Model, most: f32, test: &mut SequentialTest) -> Option<(f32, usize)> {
         let (r, t) = (&model.rotation, &model.translation);
         let row =
@@ -201,7 +203,7 @@ impl Blocks {
         let inlier = (test.wrong() / test.good).ln();
         let outlier = ((1.0 - test.wrong()) / (1.0 - test.good)).ln();
         let decision = DECISION.ln();
-        // The padding adds its fraction of misses; take it off at once, or it would count against the bound.
+        // The padding counts as misses; subtract it at once, otherwise it would count towards the bound.
         let padding = self.blocks.len() * BLOCK - self.count;
         let mut cost = -(padding as f32) * self.limit;
         let mut inliers = 0;

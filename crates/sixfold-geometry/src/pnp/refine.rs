@@ -1,16 +1,16 @@
 //! The pose that minimises the truncated squared reprojection error, `sum min(r^2, threshold^2)`, over all
-//! correspondences: Levenberg-Marquardt in which what is beyond the threshold has no pull (Blake and Zisserman 1987;
-//! Torr and Zisserman's MSAC cost, 2000).
+//! correspondences: Levenberg-Marquardt in which residuals above the threshold have no influence (Blake and Zisserman 1987; Torr
+//! and Zisserman's MSAC cost, 2000).
 
 use super::{PnpError, Prepared};
 use crate::{Camera, Mat3, NormalEquations, Pose, Vec2, Vec3};
 
-/// How a pose is refined.
+/// Options of the refinement.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RefineOptions {
     /// Correspondences with a larger reprojection error have no influence, pixels.
     pub threshold_px: f64,
-    /// Most steps.
+    /// Maximum number of steps.
     pub max_iterations: usize,
     /// Ends when a step lowers the cost by less than this fraction.
     pub convergence: f64,
@@ -40,7 +40,7 @@ impl RefineOptions {
     }
 }
 
-/// What a refinement came to.
+/// The result of a refinement.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RefineReport {
     /// The refined pose.
@@ -117,14 +117,14 @@ pub(super) fn refine(data: &Prepared, initial: &Pose, options: &RefineOptions) -
     }
 }
 
-/// The most likely pose when errors are normal in both pixel directions for inliers and evenly spread for outliers: the
-/// spread and the outliers' density are estimated from the errors below `window_px`, in turn with the pose
-/// (expectation maximisation, Dempster, Laird and Rubin 1977). Takes the hard edge off the threshold: a point's weight
-/// is the probability that it is an inlier.
+/// The most likely pose when errors are normally distributed in both pixel directions for inliers and uniformly for outliers.
+/// The standard deviation and the outliers' density are estimated from the errors below `window_px`, alternating with the pose
+/// (expectation maximisation, Dempster, Laird and Rubin 1977). This replaces the hard threshold: a point's weight is the
+/// probability that it is an inlier.
 pub(super) fn refine_by_mixture(data: &Prepared, initial: &Pose, window_px: f64, iterations: usize) -> Pose {
     let window = window_px * window_px;
     let mut pose = *initial;
-    // Until the errors say otherwise: a spread of a quarter of the window, half of its points outliers.
+    // Initial values: a standard deviation of a quarter of the window, and half of its points outliers.
     let (mut variance, mut share) = (window / 16.0, 0.5);
     let mut squares = Vec::with_capacity(data.points.len());
     for _ in 0..iterations {
@@ -160,20 +160,20 @@ pub(super) fn refine_by_mixture(data: &Prepared, initial: &Pose, window_px: f64,
     pose
 }
 
-/// How far an image point is trusted.
+/// Expected accuracy of an image point.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Trust {
-    /// How far it may be off, pixels.
+    /// Expected error, pixels.
     pub spread_px: f64,
-    /// How probably it is right at all, 0 to 1.
+    /// Probability that it is not an outlier, 0 to 1.
     pub weight: f64,
 }
 
-/// Refines a pose over correspondences each of which says how far it is trusted: least squares of the errors over their spreads,
-/// under Cauchy's distribution, by reweighting (Holland and Welsch 1977).
+/// Refines a pose over correspondences of different accuracy: least squares of the errors divided by their spreads, with the
+/// Cauchy loss, by iterative reweighting (Holland and Welsch 1977).
 ///
 /// # Errors
-/// As for [`refine_pose`]; [`PnpError::NoModel`] when what is trusted does not fix a pose.
+/// As for [`refine_pose`]; [`PnpError::NoModel`] when the trusted correspondences do not determine a pose.
 pub fn refine_trusted(
     object_points: &[Vec3],
     image_points: &[Vec2],
@@ -207,13 +207,13 @@ pub fn refine_trusted(
     Ok(pose.with_translation(pose.transform_point(&-data.centre)))
 }
 
-/// Points of a smaller weight do not count.
+/// Points with a smaller weight are ignored.
 const LEAST_WEIGHT: f64 = 1e-6;
-/// Most steps of [`refine_trusted`].
+/// Maximum number of steps of [`refine_trusted`].
 const TRUSTED_STEPS: usize = 20;
 
 /// The normal equations of the correspondences within the threshold; their cost counts all. The twist moves the object
-/// in its own frame, about its centroid, where rotation and translation are least coupled.
+/// in its own frame, about its centroid, where rotation and translation are least correlated.
 fn linearise(
     data: &Prepared,
     pose: &Pose,
@@ -237,7 +237,7 @@ fn linearise(
         }
         let weight = weight(i, square);
         let (su, sv) = (fx * inverse, fy * inverse);
-        // Rows of d(pixel)/d(point), turned into the object's frame.
+        // Rows of d(pixel)/d(point), rotated into the object's frame.
         let gu = Vec3::new(
             su * (r[(0, 0)] - a * r[(2, 0)]),
             su * (r[(0, 1)] - a * r[(2, 1)]),

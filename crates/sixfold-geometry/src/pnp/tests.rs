@@ -116,7 +116,8 @@ fn a_refinement_follows_what_is_trusted() {
         let found = refine_trusted(&case.points, &case.pixels, &trust, &camera(), &start).unwrap();
         found.rotation_angle_to(&case.truth)
     };
-    // Forty per cent are wrong: not trusted, they pull at nothing; said to be rough, hardly; trusted like the others, some.
+    // Forty per cent are wrong: with weight 0 they have no influence, with a large spread hardly any, and with the same
+    // trust as the others some.
     let none = refined(Trust { spread_px: 0.5, weight: 0.0 });
     let rough = refined(Trust { spread_px: 20.0, weight: 1.0 });
     let all = refined(Trust { spread_px: 0.5, weight: 1.0 });

@@ -1,7 +1,7 @@
-//! From the keys and values of a camera file to a camera, whichever program wrote it.
+//! Conversion of the keys and values of a camera file to a camera, whatever program wrote it.
 //!
-//! Keys are compared in lower case and without underscores, so that `camera_matrix`, `Camera_Matrix` and `cameraMatrix` are one. A
-//! key that is neither used nor known to be of no influence is refused: it may be what the writer meant.
+//! Keys are compared in lower case and without underscores, so that `camera_matrix`, `Camera_Matrix` and `cameraMatrix` are the
+//! same. A key that is neither used nor known to be irrelevant is refused, since it may be important.
 
 use std::collections::BTreeMap;
 
@@ -18,9 +18,9 @@ const WIDTH: [&str; 2] = ["width", "imagewidth"];
 const HEIGHT: [&str; 2] = ["height", "imageheight"];
 /// Other keys that are read.
 const SINGLE: [&str; 6] = ["fx", "fy", "cx", "cy", "depthscale", "distortionmodel"];
-/// Keys without influence on the image that was taken.
+/// Keys without influence on the projection.
 const WITHOUT_INFLUENCE: [&str; 35] = [
-    // Where the camera stands; and BOP's notes on how an image was taken.
+    // The camera's pose, and BOP's notes on how an image was taken.
     "camrw2c",
     "camtw2c",
     "mode",
@@ -39,13 +39,13 @@ const WITHOUT_INFLUENCE: [&str; 35] = [
     "time",
     "serial",
     "serialnumber",
-    // ROS: when, and the rectified image, which is another one than the raw image that K and D describe.
+    // ROS: the time stamp, and the rectified image, which differs from the raw image that K and D describe.
     "header",
     "r",
     "p",
     "rectificationmatrix",
     "projectionmatrix",
-    // OpenCV's calibration: what it was made from, and how well it fits.
+    // OpenCV's calibration: its inputs and its error.
     "calibrationtime",
     "nframes",
     "nrofframes",
@@ -62,7 +62,7 @@ const WITHOUT_INFLUENCE: [&str; 35] = [
 ];
 const KNOWN: &str = "fx, fy, cx, cy or a matrix (cam_K, K, camera_matrix); width, height; distortion (distortion, dist_coeffs, \
                      distortion_coefficients, D), distortion_model; depth_scale; a comment begins with _";
-/// What to do with a lens that the model does not describe.
+/// Advice for a lens that the model does not cover.
 const RECTIFY: &str = "undistort the images first (OpenCV, ROS image_proc) and give the camera of the undistorted images, without \
                        distortion";
 
@@ -93,7 +93,7 @@ impl<'a> Fields<'a> {
         Ok(Fields(fields))
     }
 
-    /// The field under one of several keys; `None` without it or where it is null.
+    /// The field under one of several keys; `None` if it is missing or null.
     fn one_of(&self, keys: &[&str]) -> Result<Option<(&'a str, &'a Value)>, String> {
         let mut present =
             keys.iter().filter_map(|key| self.0.get(*key)).filter(|(_, value)| !value.is_null());
@@ -126,7 +126,7 @@ impl<'a> Fields<'a> {
     }
 }
 
-/// Refuses what is not read and may matter.
+/// Refuses keys that are not read and may matter.
 fn check_key(key: &str, plain: &str, value: &Value) -> Result<(), String> {
     let read = [&MATRIX[..], &DISTORTION, &WIDTH, &HEIGHT, &SINGLE, &WITHOUT_INFLUENCE];
     if read.iter().any(|keys| keys.contains(&plain)) {
@@ -156,7 +156,7 @@ fn window_is_whole(value: &Value) -> bool {
     value.as_object().is_some_and(|roi| roi.values().all(zero))
 }
 
-/// Numbers in a list, in rows, or in the `data` of OpenCV's and ROS's matrices.
+/// Numbers from a list, from rows, or from the `data` of OpenCV's and ROS's matrices.
 fn numbers(key: &str, value: &Value) -> Result<Vec<f64>, String> {
     let wrong = || format!("field {key}: found {}, expected numbers", found(value));
     match value {
@@ -234,14 +234,14 @@ fn intrinsics(fields: &Fields<'_>) -> Result<[f64; 4], String> {
     Ok(all)
 }
 
-/// The coefficients, in OpenCV's order or by name; `None` without any, or where all are zero.
+/// The coefficients, in OpenCV's order or by name; `None` if there are none or all are zero.
 fn distortion(fields: &Fields<'_>) -> Result<Option<BrownConrady>, String> {
     let model = match fields.one_of(&["distortionmodel"])? {
         None => String::new(),
         Some((_, Value::String(model))) => model.to_lowercase(),
         Some((key, other)) => return Err(format!("field {key}: found {}, expected plumb_bob", found(other))),
     };
-    // Also with coefficients of zero it is no pinhole camera.
+    // Even with coefficients of zero this is not a pinhole camera.
     if matches!(model.as_str(), "equidistant" | "fisheye" | "kannala_brandt" | "kannala_brandt4" | "omni") {
         return Err(format!(
             "field distortion_model: {model} is a fisheye lens, expected plumb_bob; {RECTIFY}"
@@ -314,7 +314,7 @@ fn non_zero(d: BrownConrady) -> Option<BrownConrady> {
 /// The camera of a file's content.
 ///
 /// # Errors
-/// The field, what was found and expected, and what to do.
+/// A message with the field, the values found and expected, and advice.
 pub(super) fn camera(value: &Value) -> Result<CameraFile, String> {
     let object = value.as_object().ok_or("expected a JSON object, or the keys of a YAML or XML file")?;
     // scene_camera.json: one entry per image.

@@ -1,11 +1,11 @@
-//! JSON in which no key stands twice: of two values for one key nobody knows which was meant.
+//! JSON without repeated keys: with two values for one key it is unclear which was meant.
 
 use std::fmt;
 
 use serde::de::{Deserialize, Deserializer, Error, MapAccess, SeqAccess, Visitor};
 use serde_json::{Map, Number, Value};
 
-/// A value whose objects have every key once.
+/// A value whose objects contain every key only once.
 struct Unique(Value);
 
 struct UniqueVisitor;
@@ -71,7 +71,7 @@ impl<'de> Visitor<'de> for UniqueVisitor {
 /// The value of a text.
 ///
 /// # Errors
-/// What is wrong and where; also a key that stands twice in an object.
+/// What is wrong and where; also for a key that occurs twice in an object.
 pub(super) fn parse(text: &str) -> Result<Value, serde_json::Error> {
     serde_json::from_str::<Unique>(text).map(|unique| unique.0)
 }

@@ -23,7 +23,7 @@ pub enum CameraFileError {
     Read {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
     /// It is not JSON.
@@ -34,7 +34,7 @@ pub enum CameraFileError {
         /// What and where.
         source: serde_json::Error,
     },
-    /// What it says is no camera, or none of the image.
+    /// The content is not a valid camera, or not the image's.
     #[error("{}: {message}", path.display())]
     Content {
         /// The file.
@@ -44,10 +44,10 @@ pub enum CameraFileError {
     },
 }
 
-/// A camera and what its depth files mean.
+/// A camera and the unit of its depth files.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CameraFile {
-    /// The camera; its size is 1 x 1 where the file does not say it.
+    /// The camera; its size is 1 x 1 if the file does not state it.
     pub camera: Camera,
     /// Whether the file stated the image size (otherwise the image decides).
     pub sized: bool,
@@ -57,17 +57,17 @@ pub struct CameraFile {
 
 impl CameraFile {
     /// Reads a file with `fx fy cx cy` or a matrix (`cam_K`, `K`, `camera_matrix`), and perhaps image size, distortion and
-    /// `depth_scale`; or a `scene_camera.json` of one image. JSON, YAML or XML, whatever the file is called.
+    /// `depth_scale`; or a `scene_camera.json` of one image. JSON, YAML or XML, whatever the file's extension.
     ///
     /// # Errors
-    /// [`CameraFileError`], also for a key that is not known, and for a camera that no lens makes
-    /// ([`Camera::check_whole_image`], where the file says the image's size).
+    /// [`CameraFileError`], also for an unknown key, and for a camera that no real lens has ([`Camera::check_whole_image`], if the
+    /// file states the image's size).
     pub fn read(path: &Path) -> Result<CameraFile, CameraFileError> {
         let read = |source| CameraFileError::Read { path: path.into(), source };
         CameraFile::parse(&crate::read_regular(path, MAX_BYTES).map_err(read)?, path)
     }
 
-    /// The same of a file's bytes; `path` is for messages.
+    /// The same for a file's bytes; `path` is for messages.
     ///
     /// # Errors
     /// As [`CameraFile::read`].
@@ -88,8 +88,8 @@ impl CameraFile {
     /// The camera for an image of this size; `file` is for the message.
     ///
     /// # Errors
-    /// [`CameraFileError::Content`] where the file states another size, or where this is not the camera of a whole image of this
-    /// size ([`Camera::check_whole_image`]): intrinsics in a wrong unit, or of another resolution.
+    /// [`CameraFileError::Content`] if the file states another size, or if the intrinsics cannot belong to a whole image of this
+    /// size ([`Camera::check_whole_image`]), for example in a wrong unit or for another resolution.
     pub fn for_image(&self, width: usize, height: usize, file: &Path) -> Result<Camera, CameraFileError> {
         let mut camera = self.camera;
         if !self.sized {
@@ -102,10 +102,10 @@ impl CameraFile {
     }
 }
 
-/// Largest camera file: calibrations with the corners that they were made from take a few MB.
+/// Largest camera file: calibrations that include their corners take a few MB.
 const MAX_BYTES: u64 = 16 << 20;
 
-/// The content of a file in one of three languages, which its first character tells apart.
+/// The content of a file in one of three formats, which its first character distinguishes.
 fn content(text: &str, path: &Path) -> Result<Value, CameraFileError> {
     let wrong = |message: String| CameraFileError::Content { path: path.into(), message };
     match text.trim_start_matches('\u{feff}').trim_start().chars().next() {
@@ -157,7 +157,7 @@ mod tests {
         }
     }
 
-    /// A focal length of half a pixel gave a pose 597 m behind the camera.
+    /// A focal length of half a pixel once gave a pose 597 m behind the camera.
     #[test]
     fn an_impossible_camera_is_refused_with_advice() {
         for size in ["", &format!(", {SIZE}")] {
@@ -179,7 +179,7 @@ mod tests {
         assert!(message.contains("camera"), "{message}");
     }
 
-    /// `dist_coeffs` and a width without a height were ignored.
+    /// `dist_coeffs` and a width without a height were once ignored.
     #[test]
     fn nothing_in_a_camera_file_is_ignored_in_silence() {
         let k = r#""cam_K": [572.4, 0, 325.3, 0, 573.6, 242.0, 0, 0, 1]"#;

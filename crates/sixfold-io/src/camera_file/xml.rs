@@ -1,6 +1,7 @@
 //! The XML that OpenCV's `FileStorage` writes: nested elements, and numbers separated by blanks.
 //!
-//! A reader of exactly that: entities and document types, which could name other files or expand, are refused.
+//! The reader supports exactly this: entities and document types, which could refer to other files or expand,
+//! are refused.
 
 use serde_json::{Map, Value};
 
@@ -13,7 +14,7 @@ struct Reader<'a> {
     text: &'a str,
 }
 
-/// What is inside the root element of a text.
+/// The content of the root element of a text.
 ///
 /// # Errors
 /// What was found and what was expected.
@@ -32,7 +33,7 @@ impl<'a> Reader<'a> {
         format!("found {found:?}, expected {expected}")
     }
 
-    /// Passes over blanks, comments and the declaration.
+    /// Skips blanks, comments and the declaration.
     fn skip(&mut self) -> Result<(), String> {
         loop {
             self.text = self.text.trim_start();
@@ -46,7 +47,7 @@ impl<'a> Reader<'a> {
         if self.text.starts_with("<!") { Err(self.found("an element")) } else { Ok(()) }
     }
 
-    /// Name of an element that begins here, and whether it ends at once.
+    /// Name of an element that begins here, and whether it is empty (`<name/>`).
     fn opening(&mut self) -> Result<Option<(&'a str, bool)>, String> {
         if !self.text.starts_with('<') || self.text.starts_with("</") {
             return Ok(None);

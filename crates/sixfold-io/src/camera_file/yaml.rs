@@ -1,14 +1,15 @@
-//! The YAML that camera files are written in: block mappings and sequences, flow lists, scalars.
+//! The YAML subset of camera files: block mappings and sequences, flow lists, scalars.
 //!
-//! A reader of exactly that, rather than a YAML library, because OpenCV's `%YAML:1.0` is no YAML of any version, and because
-//! nothing here can expand: anchors, aliases and tags other than OpenCV's are refused by name, and nesting is bounded. The same
-//! holds for what a description of a camera never needs: complex keys, scalars over several lines, several documents.
+//! This is a reader of exactly this subset rather than a YAML library, because OpenCV's `%YAML:1.0` is not valid YAML of any
+//! version, and because nothing here can expand: anchors, aliases and tags other than OpenCV's are refused by name, and nesting
+//! is limited. Features that a camera file never needs are refused too: complex keys, scalars over several lines, several
+//! documents.
 
 use serde_json::{Map, Number, Value};
 
 /// Deepest nesting; camera files have three levels.
 const MAX_DEPTH: usize = 16;
-/// Tags that say no more than the value does.
+/// Tags that add no information to the value.
 const TAGS: [&str; 6] = ["!!opencv-matrix", "!!float", "!!int", "!!str", "!!map", "!!seq"];
 
 struct Line<'a> {
@@ -40,7 +41,7 @@ pub(super) fn parse(text: &str) -> Result<Value, String> {
     }
 }
 
-/// The lines of the one document, without comments and empty lines.
+/// The lines of the single document, without comments and empty lines.
 fn lines(text: &str) -> Result<Vec<Line<'_>>, String> {
     let mut lines: Vec<Line<'_>> = vec![];
     let mut ended = false;
@@ -129,7 +130,7 @@ impl<'a> Reader<'a> {
         while let Some(line) = self.lines.get_mut(self.at).filter(|l| l.indent == indent && is_item(l.text)) {
             let (number, rest) = (line.number, line.text[1..].trim_start());
             if entry(rest).is_some() && !rest.starts_with(['[', '{']) {
-                // A mapping that begins behind the dash.
+                // A mapping that begins after the dash.
                 line.indent += line.text.len() - rest.len();
                 line.text = rest;
                 let inner = line.indent;
@@ -142,7 +143,7 @@ impl<'a> Reader<'a> {
         Ok(Value::Array(list))
     }
 
-    /// The value behind a key or dash, on its line or on those that follow.
+    /// The value after a key or dash, on its line or on the following ones.
     fn value(&mut self, rest: &'a str, number: usize, indent: usize, depth: usize) -> Result<Value, String> {
         let mut rest = rest;
         if rest.starts_with('!') {
@@ -159,7 +160,7 @@ impl<'a> Reader<'a> {
         match rest.chars().next() {
             None => match self.lines.get(self.at) {
                 Some(next) if next.indent > indent || (next.indent == indent && is_item(next.text)) => {
-                    // A sequence may stand as far left as its key; behind an empty item, the next item does.
+                    // A sequence may have the same indent as its key; after an empty item, the next item has the same indent.
                     if next.indent == indent && self.in_sequence(indent) {
                         return Ok(Value::Null);
                     }
@@ -178,12 +179,12 @@ impl<'a> Reader<'a> {
         }
     }
 
-    /// Whether the line before is an item at this indent: then what follows at the same indent is the next one.
+    /// Whether the previous line is an item at this indent: then a line at the same indent is the next item.
     fn in_sequence(&self, indent: usize) -> bool {
         self.lines.get(self.at - 1).is_some_and(|l| l.indent == indent && is_item(l.text))
     }
 
-    /// Lines of text behind `|` or `>`.
+    /// Lines of text after `|` or `>`.
     fn text_block(&mut self, indent: usize) -> Value {
         let mut text = String::new();
         while let Some(line) = self.lines.get(self.at).filter(|l| l.indent > indent) {
@@ -194,7 +195,7 @@ impl<'a> Reader<'a> {
         text.into()
     }
 
-    /// A list or mapping in brackets, perhaps over several lines.
+    /// A list or mapping in brackets, possibly over several lines.
     fn flow(&mut self, first: &str, number: usize) -> Result<Value, String> {
         let mut text = first.to_owned();
         let mut brackets = Brackets::default();
@@ -222,7 +223,7 @@ fn is_item(text: &str) -> bool {
     text == "-" || text.starts_with("- ")
 }
 
-/// How many brackets are open, and the quote that is.
+/// The number of open brackets, and the open quote.
 #[derive(Default)]
 struct Brackets {
     open: i64,
@@ -244,7 +245,7 @@ impl Brackets {
     }
 }
 
-/// What is left of a list or mapping in brackets.
+/// The remaining text of a list or mapping in brackets.
 struct Flow<'a> {
     text: &'a str,
 }
@@ -319,7 +320,7 @@ impl Flow<'_> {
     }
 }
 
-/// What a word stands for.
+/// The value of a word.
 pub(super) fn scalar(text: &str) -> Value {
     for quote in ['"', '\''] {
         if let Some(inside) = text.strip_prefix(quote).and_then(|t| t.strip_suffix(quote)) {

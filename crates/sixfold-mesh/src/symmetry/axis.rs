@@ -1,7 +1,8 @@
-//! An axis and how it is moved until rotations about it minimise the distance between an object and itself.
+//! Rotation axes, and their refinement: an axis is moved until rotations about it minimise the distance between an object and
+//! itself.
 //!
-//! As in iterative closest points (Chen and Medioni 1992): a residual is the distance of a rotated point to the surface, along
-//! the normal there. The unknowns are those that matter: two rotations of the axis across itself and two shifts across it.
+//! As in iterative closest points (Chen and Medioni 1992), a residual is the distance of a rotated point to the surface, along
+//! the normal there. The unknowns are the four degrees of freedom of an axis: two rotations and two shifts perpendicular to it.
 
 use std::f64::consts::TAU;
 
@@ -22,14 +23,14 @@ impl Axis {
         Pose::new(rotation, self.point - rotation * self.point)
     }
 
-    /// The angle between two axes without their senses, radians.
+    /// The angle between two axes regardless of their signs, radians.
     pub fn angle_to(&self, other: &Axis) -> f64 {
         let cross = self.direction.cross(&other.direction).norm();
         cross.atan2(self.direction.dot(&other.direction).abs())
     }
 
-    /// The axis with the same line and its point the nearest to `centre`; its sense such that the largest component of the
-    /// direction is positive.
+    /// The same line, with the point nearest to `centre` and the sign of the direction such that its largest component is
+    /// positive.
     pub fn tidy(&self, centre: &Vec3) -> Axis {
         let direction = self.direction.normalize();
         let largest = direction[direction.iamax()];
@@ -39,13 +40,13 @@ impl Axis {
     }
 }
 
-/// The angles of all rotations of an axis of this order but the identity.
+/// The angles of all rotations of an axis of this order except the identity.
 pub(super) fn angles_of_order(order: u32) -> Vec<f64> {
     (1..order).map(|k| f64::from(k) * TAU / f64::from(order)).collect()
 }
 
-/// Moves an axis so that the rotated `points` come as near to the surface as they can. `residual` gives at a point the distance
-/// to the surface and its gradient. Distances much larger than `scale` (metres) count less (Geman and McClure 1985).
+/// Moves an axis so that the rotated `points` come as close to the surface as possible. `residual` returns the distance to the
+/// surface at a point, and its gradient. Distances much larger than `scale` (metres) count less (Geman and McClure 1985).
 pub(super) fn refine(
     axis: &Axis,
     angles: &[f64],
@@ -61,7 +62,7 @@ pub(super) fn refine(
         let v = axis.direction.cross(&u);
         let (mut h, mut g, mut cost) = (Matrix4::zeros(), Vector4::zeros(), 0.0);
         for rotation in angles.iter().map(|angle| axis.rotation(*angle)) {
-            // What moving the axis' point by `d` does to every rotated point: d - R d.
+            // Moving the axis' point by `d` moves every rotated point by d - R d.
             let shifts = [u, v].map(|d| d - rotation.transform_direction(&d));
             for p in points {
                 let arm = p - axis.point;

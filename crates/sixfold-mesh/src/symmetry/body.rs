@@ -1,4 +1,4 @@
-//! An object prepared to be held against itself: samples of its surface, its distance field and its tree of triangles.
+//! An object prepared for comparison with itself: samples of its surface, its distance field and its tree of triangles.
 
 use nalgebra::{Matrix3, SymmetricEigen};
 use rand::SeedableRng;
@@ -13,9 +13,9 @@ use super::{ColorDifference, Deviation, SymmetryOptions, percentile};
 use crate::Mesh;
 use crate::surface::Surface;
 
-/// Samples that the distance field is made from, and whose colours are compared.
+/// Samples from which the distance field is computed, and whose colours are compared.
 const FIELD_SAMPLES: usize = 8000;
-/// Distance at which a point counts less when axes are refined, as a fraction of the diameter.
+/// Distance beyond which a point is weighted less when axes are refined, as a fraction of the diameter.
 const ROBUST_SCALE: f64 = 0.02;
 
 /// An object and what is computed from it once.
@@ -26,9 +26,9 @@ pub(super) struct Body {
     pub noise: f64,
     /// Centroid of the surface.
     pub centre: Vec3,
-    /// Of the surface's inertia.
+    /// Principal axes of the surface's inertia.
     pub principal_axes: [Vec3; 3],
-    /// Points of the surface, as dense everywhere; any first few of them are spread over all of it.
+    /// Points of uniform density on the surface, ordered so that the first few are already spread over all of it.
     pub points: Vec<Vec3>,
     pub field: DistanceField,
     surface: Surface,
@@ -60,12 +60,12 @@ impl Body {
         Body { diameter, noise: options.noise, centre, principal_axes, points, field, surface, colors }
     }
 
-    /// Distance at which a point counts less, metres.
+    /// Distance beyond which a point is weighted less, metres.
     pub fn robust_scale(&self) -> f64 {
         ROBUST_SCALE * self.diameter + 2.0 * self.noise
     }
 
-    /// Mean distance on the field of the first points, rotated about an axis, metres.
+    /// Mean distance, from the field, of the first `count` points rotated about an axis, metres.
     pub fn field_mean(&self, axis: &Axis, angles: &[f64], count: usize) -> f64 {
         let points = &self.points[..count.min(self.points.len())];
         let of_angle = |angle: &f64| {
@@ -75,7 +75,8 @@ impl Body {
         angles.iter().map(of_angle).sum::<f64>() / (points.len() * angles.len()) as f64
     }
 
-    /// The axis moved in some steps to where rotations of the first points by these angles fit best, on the surface itself.
+    /// The axis refined in `steps` steps so that rotations of the first `count` points by these angles fit the surface
+    /// itself best.
     pub fn refined(&self, axis: &Axis, angles: &[f64], (count, steps): (usize, usize)) -> Axis {
         let points = &self.points[..count.min(self.points.len())];
         let residual = |p: &Vec3| {
@@ -86,7 +87,7 @@ impl Body {
         refine(axis, angles, points, self.robust_scale(), steps, residual)
     }
 
-    /// How far the first `count` points are from the surface when they are rotated: the worst of the angles.
+    /// How far the first `count` points are from the surface when they are rotated; the worst over the angles.
     pub fn deviation(&self, axis: &Axis, angles: &[f64], count: usize) -> Deviation {
         let points = &self.points[..count.min(self.points.len())];
         let mut worst = Deviation { p95: 0.0, max: 0.0 };
@@ -99,7 +100,8 @@ impl Body {
         worst
     }
 
-    /// How much colours differ under rotations about an axis, the worst of the angles; `None` for an object without colours.
+    /// How much colours differ under rotations about an axis, the worst over the angles; `None` for an object without
+    /// colours.
     pub fn color_difference(&self, axis: &Axis, angles: &[f64]) -> Option<ColorDifference> {
         let colors = self.colors.as_ref()?;
         let differences = angles.iter().map(|angle| colors.difference(&axis.rotation(*angle)));

@@ -1,7 +1,7 @@
-//! How much an object's colours differ from themselves when it is rotated.
+//! How much an object's colours change at its surface when it is rotated.
 //!
-//! Colours are smoothed over the surface first: a rotation that is off by a degree moves the edges of a print, and they would
-//! count as differences. What is smaller than the smoothing radius counts by its area.
+//! Colours are smoothed over the surface first: a rotation with an error of a degree moves the edges of a print, which would
+//! otherwise count as differences. A detail smaller than the smoothing radius counts in proportion to its area.
 
 use sixfold_geometry::{KdTree, Pose, RgbImage, Vec3};
 
@@ -10,7 +10,7 @@ use crate::{Mesh, SurfaceSamples};
 
 /// Radius over which colours are smoothed, as a fraction of the diameter: that of some twenty samples.
 const SMOOTHING: f64 = 0.04;
-/// Samples at which colours are compared; all of them are smoothed over.
+/// Samples at which colours are compared; the smoothing uses all samples.
 const COMPARED: usize = 1500;
 
 /// Colours of a surface at samples of it.
@@ -21,7 +21,7 @@ pub(super) struct SurfaceColors {
     normals: Vec<Vec3>,
     /// sRGB, 0 to 1.
     colors: Vec<Vec3>,
-    /// Smoothed ones of the first samples.
+    /// Smoothed colours of the first samples.
     smoothed: Vec<Vec3>,
     /// Metres.
     radius: f64,
@@ -45,7 +45,8 @@ impl SurfaceColors {
         Some(this)
     }
 
-    /// The mean colour around a point of the surface, of samples that face the same way: walls are thin, and their sides differ.
+    /// The mean colour around a point of the surface, of samples with a similar normal: walls are thin, and their two sides have
+    /// different colours.
     fn smooth(&self, p: &Vec3, normal: &Vec3) -> Vec3 {
         let near = self.tree.within(p, self.radius);
         let alike = near.iter().map(|n| n.index).filter(|i| self.normals[*i].dot(normal) > 0.0);
@@ -87,7 +88,7 @@ fn color_at(mesh: &Mesh, face: usize, p: &Vec3) -> Option<Vec3> {
     Some(terms.fold(Vec3::zeros(), |sum, term| sum + term))
 }
 
-/// The pixel of a texture, which repeats itself.
+/// The pixel of a texture, which is repeated outside 0..1.
 fn texel(texture: &RgbImage, u: f64, v: f64) -> Option<Vec3> {
     let (width, height) = texture.size();
     if width == 0 || height == 0 || !u.is_finite() || !v.is_finite() {

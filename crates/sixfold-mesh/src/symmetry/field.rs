@@ -1,4 +1,4 @@
-//! Distances to a surface on a grid, interpolated: thousands of axes are scored by looking up instead of searching.
+//! Distances to a surface on a grid, interpolated: thousands of axes are scored by lookup instead of search.
 
 use sixfold_geometry::{KdTree, Vec3};
 
@@ -27,7 +27,7 @@ impl DistanceField {
         DistanceField { corner, cell, values: (0..SIDE * SIDE * SIDE).map(value).collect() }
     }
 
-    /// Distance and its gradient at a point; beyond the cube those of its border.
+    /// Distance and its gradient at a point; outside the cube, those at its border.
     pub fn at(&self, p: &Vec3) -> (f64, Vec3) {
         let last = (SIDE - 1) as f64 - 1e-9;
         let place = ((p - self.corner) / self.cell).map(|c| c.clamp(0.0, last));

@@ -1,13 +1,12 @@
-//! Rotations that map an object onto itself, found in its mesh and held against its colours.
+//! Rotations that map an object onto itself, found from its mesh and checked against its colours.
 //!
 //! Axes are proposed by a scan of all directions (`scan.rs`), refined on the surface (`axis.rs`), tested for every order and for
 //! any angle, and completed to a group (`search.rs`). Each comes with its evidence: how far rotated points are from the
-//! surface, and how much colours differ. Reflections are no rotations and are not searched: no object can be rotated into
-//! its mirror image.
+//! surface, and how much colours differ. Reflections are not searched, since no object can be rotated into its mirror image.
 //!
 //! Candidates by moments: after Martinet et al. 2006; proposals that are verified on the surface: after Mitra et al. 2006. What
-//! counts as a symmetry: Hodan et al. 2020 (BOP), who bound the Hausdorff distance and leave out what the texture resolves; their
-//! bound is the wider of the two here.
+//! counts as a symmetry: Hodan et al. 2020 (BOP), who bound the Hausdorff distance and leave out symmetries that the texture
+//! resolves; their bound is the wider of the two here.
 
 mod axis;
 mod body;
@@ -21,36 +20,38 @@ use sixfold_geometry::{OptionError, Pose, Vec3};
 use crate::{ContinuousSymmetry, Mesh};
 use axis::{Axis, angles_of_order};
 
-/// A sure symmetry: 95 of 100 points stay this near to the surface, as a fraction of the diameter. Scanned bowls, a plate and a
-/// can stay below (docs/objects.md), and so do 16 facets of a cylinder.
+/// A sure symmetry: 95 % of the points stay within this distance of the surface, as a fraction of the diameter. Scanned bowls, a
+/// plate and a can stay below (docs/objects.md), and so does a cylinder with 16 facets.
 const SURE_P95: f64 = 0.01;
-/// A sure symmetry: all points stay this near. The handle of a mug is further away, and so is the knob of LM-O's glue.
+/// A sure symmetry: all points stay within this distance. The handle of a mug is further away, and so is the knob of LM-O's glue.
 const SURE_MAX: f64 = 0.04;
-/// A likely symmetry: 95 of 100 points. LM-O's egg box and glue, which its `models_info.json` calls symmetric, reach 0.02.
+/// A likely symmetry: 95 % of the points. LM-O's egg box and glue, which its `models_info.json` calls symmetric, reach 0.02.
 const LIKELY_P95: f64 = 0.03;
-/// A likely symmetry: all points. A tenth of the diameter is the bound of Hodan et al. 2020, within which every object was
-/// then inspected; their 15 mm for small objects would take any object of 5 cm for symmetric.
+/// A likely symmetry: all points. A tenth of the diameter is the bound of Hodan et al. 2020, who then inspected every object
+/// within it; with their 15 mm for small objects, any object of 5 cm would count as symmetric.
 const LIKELY_MAX: f64 = 0.1;
-/// What expected noise adds, in standard deviations and as squares. Both the moved point and the surface have it, but the nearest
-/// point is taken: boxes with independent noise on their vertices reach 1.7 and 3.3 (`noise_of_a_millimetre` in the tests).
+/// The increase of the limits by expected noise, in standard deviations, added in squares. Both the moved point and the surface
+/// have noise, but the distance is to the nearest point: boxes with independent noise on their vertices reach 1.7 and 3.3
+/// (`noise_of_a_millimetre` in the tests).
 const NOISE_P95: f64 = 2.0;
 const NOISE_MAX: f64 = 4.0;
-/// Colours are the same where 95 of 100 smoothed ones differ by less, 0 to 1.
+/// Colours are the same if 95 % of the smoothed ones differ by less than this, 0 to 1.
 const SURE_COLOR: f64 = 0.1;
-/// Colours may be the same: gloss of one lamp is part of the texture of a scanned plate, which reaches 0.12.
+/// Colours may be the same if they differ by less than this: a scanned plate, whose texture contains the gloss of a lamp, reaches
+/// 0.12.
 const LIKELY_COLOR: f64 = 0.2;
-/// Maximum noise that may be expected, metres, and as a fraction of the diameter: with more of it anything would be symmetric.
+/// Maximum noise that may be expected, metres, and as a fraction of the diameter: with more noise anything would be symmetric.
 const MAX_NOISE: f64 = 0.02;
 const MAX_RELATIVE_NOISE: f64 = 0.02;
 
-/// What to expect of a mesh.
+/// Options of the search for symmetries.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SymmetryOptions {
-    /// Standard deviation of the surface's noise, metres: 0 for a drawn mesh, 0.001 for one from photographs.
+    /// Standard deviation of the surface's noise, metres: 0 for a CAD mesh, 0.001 for a mesh from photographs.
     pub noise: f64,
     /// Points of the surface that are tested under every rotation.
     pub samples: usize,
-    /// Decides which points of the surface are taken.
+    /// Seed of the surface samples.
     pub seed: u64,
 }
 
@@ -69,14 +70,14 @@ impl SymmetryOptions {
     }
 }
 
-/// How sure a symmetry is.
+/// How certain a symmetry is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Verdict {
-    /// It is none.
+    /// Not a symmetry.
     None,
-    /// Proposed: to be inspected.
+    /// Proposed; it should be inspected.
     Likely,
-    /// The deviation is within what meshes of symmetric objects have.
+    /// The deviation is as small as in meshes of symmetric objects.
     Sure,
 }
 
@@ -91,21 +92,21 @@ impl Verdict {
     }
 }
 
-/// How far points of the surface are from the surface once they are rotated; of several rotations the worst.
+/// How far points of the surface are from the surface after a rotation; the worst over several rotations.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Deviation {
-    /// 95 of 100 points are as near, metres.
+    /// 95 % of the points are within this distance, metres.
     pub p95: f64,
-    /// All tested points are as near, metres.
+    /// All tested points are within this distance, metres.
     pub max: f64,
 }
 
-/// How much smoothed colours differ once the object is rotated, 0 to 1 (black and white); of several rotations the worst.
+/// How much smoothed colours differ after a rotation, 0 to 1 (black and white); the worst over several rotations.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ColorDifference {
     /// Mean over the surface.
     pub mean: f64,
-    /// 95 of 100 points differ by less.
+    /// 95 % of the points differ by less than this.
     pub p95: f64,
 }
 
@@ -114,7 +115,7 @@ pub struct ColorDifference {
 pub struct FoundSymmetry {
     /// Unit direction in the object's frame; its largest component is positive.
     pub axis: Vec3,
-    /// The point of the axis that is nearest to the centroid of the surface, metres.
+    /// The point of the axis nearest to the centroid of the surface, metres.
     pub point: Vec3,
     /// Rotations by multiples of a full turn over this number are symmetries; `None` where all rotations are.
     pub order: Option<u32>,
@@ -131,7 +132,7 @@ pub struct FoundSymmetry {
 }
 
 impl FoundSymmetry {
-    /// The rotations of a discrete symmetry but the identity; none for a continuous one.
+    /// The rotations of a discrete symmetry except the identity; empty for a continuous one.
     pub fn poses(&self) -> Vec<Pose> {
         let Some(order) = self.order else { return vec![] };
         let axis = Axis { direction: self.axis, point: self.point };
@@ -152,17 +153,17 @@ impl FoundSymmetry {
 
 /// The symmetries of a mesh that are at least likely by their shape, continuous ones first, then by order.
 ///
-/// Discrete ones form a group as far as they are sure: a square prism has one axis of order 4 and four of order 2. About a
-/// continuous axis no discrete symmetry is listed, and of the half turns across it one, for the others follow from both. Where
-/// colours allow fewer rotations than the shape, the largest order that they allow is listed too. A sphere has three
-/// continuous axes. The same mesh and options give the same symmetries.
+/// Sure discrete symmetries form a group: a square prism has one axis of order 4 and four of order 2. About a continuous axis no
+/// discrete symmetry is listed; of the half turns perpendicular to it, one is listed, since the others follow. Where colours
+/// allow fewer rotations than the shape, the largest order that they allow is listed too. A sphere has three continuous axes. The
+/// same mesh and options give the same symmetries.
 ///
 /// # Errors
 /// [`OptionError`] for options out of their range, also for noise above a fiftieth of the object's diameter.
 pub fn find_symmetries(mesh: &Mesh, options: &SymmetryOptions) -> Result<Vec<FoundSymmetry>, OptionError> {
     options.check()?;
     let body = body::Body::new(mesh, options);
-    // A single point, or what is too small to have a shape in f64.
+    // A single point, or an object too small to have a shape in f64.
     if !(body.diameter > 1e-9) {
         return Ok(vec![]);
     }
@@ -171,12 +172,12 @@ pub fn find_symmetries(mesh: &Mesh, options: &SymmetryOptions) -> Result<Vec<Fou
     Ok(search::Search::new(&body).run())
 }
 
-/// What a record keeps of found symmetries that are sure: discrete rotations and continuous axes.
+/// The sure symmetries in the form of an object's record: discrete rotations and continuous axes.
 pub fn sure_symmetries(found: &[FoundSymmetry], with_color: bool) -> (Vec<Pose>, Vec<ContinuousSymmetry>) {
     let sure = || found.iter().filter(move |s| s.verdict(with_color) == Verdict::Sure);
     let mut discrete: Vec<Pose> = vec![];
     for pose in sure().flat_map(FoundSymmetry::poses) {
-        // An order of the colours may be listed beside the axis' own.
+        // An order allowed by the colours may be listed besides the order of the shape.
         if discrete.iter().all(|d| d.rotation_angle_to(&pose) > 1e-3) {
             discrete.push(pose);
         }

@@ -1,8 +1,8 @@
-//! Where axes may be: all directions are scored on the distance field, and those better than their neighbours are refined.
+//! Candidate axes: all directions are scored on the distance field, and the local optima are refined.
 //!
-//! A rotation of order n holds that of each prime factor of n, so primes are enough. The axis of a rotation that maps a body
-//! onto itself runs through its centroid, and is a principal axis of inertia or lies in a space of equal moments (Martinet et
-//! al. 2006, section 3): principal axes are always among the candidates.
+//! An axis of order n also has the order of each prime factor of n, so primes are enough. The axis of a rotation that maps a
+//! body onto itself runs through its centroid, and is a principal axis of inertia or lies in a space of equal moments
+//! (Martinet et al. 2006, section 3): principal axes are always among the candidates.
 
 use std::f64::consts::TAU;
 
@@ -11,22 +11,23 @@ use sixfold_geometry::{KdTree, Vec3, sphere_directions};
 use super::axis::{Axis, angles_of_order, refine};
 use super::body::Body;
 
-/// Prime orders that are looked for.
+/// Prime orders that are searched.
 const PRIMES: [u32; 4] = [2, 3, 5, 7];
 /// Directions on the sphere: three degrees apart.
 const DIRECTIONS: usize = 4000;
-/// Points that score a direction.
+/// Points with which a direction is scored.
 const POINTS: usize = 160;
-/// Best directions of a prime order that are refined.
+/// Number of best directions per prime order that are refined.
 const REFINED: usize = 16;
 /// Steps of their refinement on the field.
 const STEPS: usize = 8;
 /// Axes of one order closer than this are the same, radians.
 pub(super) const SAME_AXIS: f64 = 0.07;
-/// Mean distance on the field, as a fraction of the diameter, above which an axis is none.
+/// Mean distance from the field, as a fraction of the diameter, above which an axis is rejected.
 pub(super) const WORST_MEAN: f64 = 0.035;
 
-/// Axes that may be symmetries, the most promising of each order first, orders above 2 before it: they are rarer.
+/// Axes that may be symmetries, the most promising of each order first. Orders above 2 come before order 2, because they are
+/// rarer.
 pub(super) fn candidates(body: &Body) -> Vec<Axis> {
     let half: Vec<Vec3> = sphere_directions(DIRECTIONS).into_iter().filter(|d| d.z > 0.0).collect();
     let both: Vec<Vec3> = half.iter().copied().chain(half.iter().map(|d| -d)).collect();

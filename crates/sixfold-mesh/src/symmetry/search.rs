@@ -1,4 +1,4 @@
-//! Which orders an axis has, and which other axes follow from those found: the symmetries of a body form a group.
+//! The orders of an axis, and the other axes that follow from those found: the symmetries of a body form a group.
 
 use std::f64::consts::TAU;
 
@@ -10,24 +10,25 @@ use super::body::Body;
 use super::scan::{SAME_AXIS, WORST_MEAN, candidates};
 use super::{Deviation, FoundSymmetry, Verdict, color_verdict, shape_verdict};
 
-/// Highest order that is looked for: nuts have 6, twelve-sided knobs 12.
+/// Highest order that is searched: nuts have 6, twelve-sided knobs 12.
 const MAX_ORDER: u32 = 12;
-/// Rotations at which a continuous symmetry is tested: multiples of the golden angle come near no order.
+/// Rotations at which a continuous symmetry is tested: multiples of the golden angle are not close to the rotations of any
+/// order.
 const ANGLES: usize = 16;
-/// Points by which an axis is rejected before all are tested.
+/// Points with which an axis can be rejected before all points are tested.
 const FEW: usize = 250;
-/// Points by which an axis is refined on the surface, and steps: first, and when it is accepted.
+/// Points with which an axis is refined on the surface, and steps of the refinement: at first, and when it is accepted.
 const FIRST: (usize, usize) = (250, 5);
 const ALL: (usize, usize) = (1000, 2);
 /// Maximum number of axes: an icosahedron has 31.
 const MAX_AXES: usize = 31;
-/// How far the angle of a product of two rotations may be off one of an order, radians.
+/// Largest difference between the angle of a product of two rotations and an angle of an order, radians.
 const ANGLE_TOLERANCE: f64 = 0.06;
-/// Half turns across a continuous axis among which the one is looked for that keeps the colours.
+/// Number of half turns perpendicular to a continuous axis that are tried to find the one that preserves the colours.
 const FLIPS: usize = 36;
 
-/// Colours differ, or the surface is off, by at most this fraction where some rotations about an axis are listed beside all:
-/// fewer angles always fit a little better.
+/// Some rotations about an axis are listed besides all rotations only if their difference in colour or shape is at most this
+/// fraction of the other's: fewer angles always fit a little better.
 const CLEARER: f64 = 0.5;
 
 /// One order of one axis, with its evidence.
@@ -72,12 +73,12 @@ impl<'a> Search<'a> {
         self.report()
     }
 
-    /// A sure continuous axis.
+    /// The sure continuous axis, if there is one.
     fn round(&self) -> Option<Tested> {
         self.found.iter().find(|t| t.order.is_none() && t.verdict == Verdict::Sure).copied()
     }
 
-    /// A body with a sure continuous axis is as round about all axes, or has half turns across the axis, or neither.
+    /// A body with a sure continuous axis is a sphere, or has half turns perpendicular to the axis, or neither.
     fn finish_round(&mut self, round: &Tested) {
         let axis = &round.axis;
         self.found = vec![*round];
@@ -90,7 +91,7 @@ impl<'a> Search<'a> {
             self.found.extend(self.tested(&third, None));
             return;
         }
-        // Of all half turns across the axis, that which keeps the colours best.
+        // Of all half turns perpendicular to the axis, the one that preserves the colours best.
         let Some(flip) = self.tested(&across, Some(2)) else { return };
         let rotated = |k: usize| {
             let turn = axis.rotation(k as f64 * std::f64::consts::PI / FLIPS as f64);
@@ -123,14 +124,14 @@ impl<'a> Search<'a> {
         self.found.extend(more);
     }
 
-    /// The refined axis with its evidence, `None` where it is no symmetry.
+    /// The refined axis with its evidence; `None` if it is not a symmetry.
     fn tested(&self, axis: &Axis, order: Option<u32>) -> Option<Tested> {
         let body = self.body;
         let angles = order.map_or_else(any_angles, angles_of_order);
         if body.field_mean(axis, &angles, FEW) > WORST_MEAN * body.diameter + body.noise {
             return None;
         }
-        // A few of many angles hold an axis as well.
+        // A few of the angles are enough to refine an axis.
         let step = angles.len().div_ceil(4);
         let few: Vec<f64> = angles.iter().copied().step_by(step).collect();
         let refined = body.refined(axis, &few, FIRST).tidy(&body.centre);
@@ -168,7 +169,7 @@ impl<'a> Search<'a> {
         }
     }
 
-    /// The axes of `b` after `a`, and where each takes the other's axis.
+    /// The axis of the product of `a` and `b`, and the axes to which each rotates the other's axis.
     fn products(&self, a: &Tested, b: &Tested) -> Vec<Axis> {
         let turn = |t: &Tested| {
             let direction = UnitVector::new_unchecked(t.axis.direction);
@@ -187,7 +188,8 @@ impl<'a> Search<'a> {
         directions.into_iter().flatten().map(through).collect()
     }
 
-    /// Refined axes may have met. Of one axis stays what no other says as surely: of the same order the one that fits best.
+    /// Removes repeated axes, since refined axes may have become the same. An entry of an axis is removed if another entry with
+    /// a verdict at least as sure implies it; of equal entries, the one that fits best stays.
     fn leave_out_repetitions(&mut self) {
         let all = std::mem::take(&mut self.found);
         let says = |a: &Tested, b: &Tested| match (a.order, b.order) {
@@ -210,9 +212,9 @@ impl<'a> Search<'a> {
         self.found = (0..all.len()).filter(|i| !is_repeated(*i)).map(|i| all[i]).collect();
     }
 
-    /// About an axis that may be continuous stays a discrete symmetry that fits clearly better: a prism of twelve sides has its
-    /// own. Of the half turns across it every one is otherwise as likely as the others, and one is enough. Of a body that may be
-    /// a ball three axes are.
+    /// Removes symmetries that follow from a continuous axis. A discrete symmetry that fits clearly better is kept: a prism of
+    /// twelve sides has its own. Otherwise all half turns perpendicular to the axis are equally likely, and one is kept. For a
+    /// body that may be a sphere, three axes are kept.
     fn leave_out_what_follows(&mut self) {
         let round: Vec<Tested> = self.found.iter().filter(|t| t.order.is_none()).copied().collect();
         let Some(best) = round.iter().map(|t| t.deviation.p95).reduce(f64::min) else { return };
@@ -230,7 +232,7 @@ impl<'a> Search<'a> {
         self.found.extend(flip);
     }
 
-    /// What was found, with its colours and what these allow.
+    /// The symmetries found, with their colour differences and the orders that the colours allow.
     fn report(self) -> Vec<FoundSymmetry> {
         let mut report: Vec<FoundSymmetry> = vec![];
         for tested in &self.found {
@@ -243,7 +245,7 @@ impl<'a> Search<'a> {
         report
     }
 
-    /// The largest order below that of an axis which keeps the colours clearly better, unless it is listed for its shape.
+    /// The largest order below that of an axis that preserves the colours clearly better, unless it is listed for its shape.
     fn part_by_color(&self, tested: &Tested, whole: &FoundSymmetry) -> Option<FoundSymmetry> {
         let whole_color = whole.color.filter(|_| whole.by_shape_and_color < whole.by_shape)?;
         let is_part = |n: &u32| tested.order.is_none_or(|order| n < &order && order.is_multiple_of(*n));
@@ -280,7 +282,7 @@ impl<'a> Search<'a> {
     }
 }
 
-/// Angles that stand for all.
+/// Angles that represent all rotations of a continuous symmetry.
 fn any_angles() -> Vec<f64> {
     let golden = std::f64::consts::PI * (3.0 - 5f64.sqrt());
     (1..=ANGLES).map(|k| (k as f64 * golden).rem_euclid(TAU)).collect()

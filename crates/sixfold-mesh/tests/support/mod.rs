@@ -1,8 +1,8 @@
-//! Where real data is: `SIXFOLD_DATA`, or `../shared/data` beside the workspace.
+//! The folder of real data: `SIXFOLD_DATA`, or `../shared/data` beside the workspace.
 
 use std::path::PathBuf;
 
-/// The folder of shared data; says so where there is none.
+/// The folder of shared data; prints a message if there is none.
 pub fn data() -> Option<PathBuf> {
     let folder = std::env::var_os("SIXFOLD_DATA")
         .map(PathBuf::from)

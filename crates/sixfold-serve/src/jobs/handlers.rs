@@ -1,4 +1,4 @@
-//! Jobs as clients see them: listed, watched, cancelled, their results and images.
+//! The API of jobs: list, watch, cancel and remove them, and get results and images.
 
 use std::convert::Infallible;
 use std::sync::Arc;
@@ -22,7 +22,7 @@ use crate::error::{Answer, ApiError, Problem};
 
 /// Longest time that a client may wait for a result in one request, seconds: below the limit of requests.
 const MAX_WAIT: f64 = 60.0;
-/// So often a silent stream says that it is alive.
+/// Interval of keep-alive messages in an idle stream.
 const KEEP_ALIVE: Duration = Duration::from_secs(10);
 
 /// A job.
@@ -87,7 +87,7 @@ impl JobView {
     }
 }
 
-/// The answer to a request that became a job.
+/// The answer to a request that was accepted as a job.
 pub(crate) struct Accepted(pub JobView);
 
 impl IntoResponse for Accepted {
@@ -194,7 +194,7 @@ pub(crate) async fn job_result(
     }
 }
 
-/// The record when the job has ended, or when the time is over.
+/// The record when the job has ended, or when the waiting time is over.
 async fn ended(job: &Job, wait: Duration) -> JobRecord {
     let mut watched = job.record.subscribe();
     let _ = tokio::time::timeout(wait, watched.wait_for(|record| record.state.is_final())).await;
@@ -216,7 +216,7 @@ pub(crate) async fn job_overlay(State(app): Shared, Path(id): Path<String>) -> A
     file(&app, job, "overlay.png", "image/png").await
 }
 
-/// A file of a job under one of our names.
+/// A file of a job under one of the server's file names.
 async fn file(
     app: &Arc<App>,
     job: Arc<Job>,
@@ -243,7 +243,7 @@ pub(crate) async fn job_events(
 ) -> Answer<Sse<impl Stream<Item = Result<Event, Infallible>>>> {
     let job = app.jobs.get(&id)?;
     let mut watched = job.record.subscribe();
-    // The state now is the first event.
+    // The current state is the first event.
     watched.mark_changed();
     let state = Watched { app, job, watched, is_over: false };
     let events = stream::unfold(state, |mut state| async move {
@@ -267,7 +267,7 @@ impl Watched {
             return None;
         }
         loop {
-            // How many jobs wait before this one changes without a change of its own.
+            // The number of jobs before this one can change without a change of this job.
             let changed = tokio::time::timeout(Duration::from_secs(1), self.watched.changed()).await;
             if self.app.jobs.is_ending() {
                 return None;

@@ -1,8 +1,9 @@
-//! Jobs: what was asked for, laid down in a folder each, worked on one after the other, kept with what came of it.
+//! Jobs: requests that are stored in one folder each, processed in order, and kept with their results.
 //!
-//! `DATA/jobs/ID` holds `job.json` (the state), `request.json` (what was asked), the uploaded files under names of ours, and later
-//! `result.json` and `overlay.png`. A folder is written under another name first and moved into place as a whole; `job.json` is
-//! replaced as a whole. A job that ran when the process ended waits again when it starts; one that did so three times has failed.
+//! `DATA/jobs/ID` holds `job.json` (the state), `request.json` (the request), the uploaded files under the server's names, and
+//! later `result.json` and `overlay.png`. A folder is written under another name first and moved into place as a whole; `job.json`
+//! is replaced as a whole. A job that was running when the process ended is queued again at the next start; after three such
+//! attempts it has failed.
 
 mod handlers;
 mod queue;

@@ -16,10 +16,10 @@ use super::work::{Stopped, Work};
 use crate::error::{Answer, ApiError, ServeError};
 use crate::options::ServerOptions;
 
-/// A job that ended the process this often is not tried again.
+/// A job that was running this many times when the process ended is not tried again.
 const MAX_ATTEMPTS: u32 = 3;
 
-/// What a worker does with a job: the result as JSON.
+/// The function that processes a job and returns the result as JSON.
 pub(crate) type Run = dyn Fn(&mut Work<'_>) -> Result<serde_json::Value, Stopped> + Send + Sync;
 
 /// All jobs of a data folder.
@@ -31,13 +31,13 @@ pub(crate) struct Jobs {
     state: Mutex<State>,
     changed: Condvar,
     ends: AtomicBool,
-    /// No second server writes here.
+    /// Keeps a second server from writing here.
     _lock: WriteLock,
 }
 
 #[derive(Default)]
 struct State {
-    /// The id beside the number: records that cannot be read have none of their own.
+    /// The key contains the id besides the number, because unreadable records have no number.
     by_number: BTreeMap<(u64, String), Arc<Job>>,
     by_id: HashMap<String, Arc<Job>>,
     last_number: u64,
@@ -61,7 +61,7 @@ impl State {
 }
 
 impl Jobs {
-    /// The jobs in `DATA/jobs`; those that ran when a server ended wait again.
+    /// Opens the jobs in `DATA/jobs`; jobs that were running when a server ended are queued again.
     pub fn open(options: &ServerOptions) -> Result<Jobs, ServeError> {
         let folder = options.data.join("jobs");
         let io = |source| ServeError::Io { path: folder.clone(), source };
@@ -72,7 +72,7 @@ impl Jobs {
             let path = entry.map_err(io)?.path();
             let name = path.file_name().and_then(|n| n.to_str()).unwrap_or_default().to_owned();
             if name.starts_with('.') && path.is_dir() {
-                // A request that was being laid down when the server ended: its client was told nothing yet.
+                // A request that was being stored when the server ended: its client has not received an answer.
                 let _ = std::fs::remove_dir_all(&path);
             } else if is_id(&name) {
                 state.insert(Arc::new(found(path, name)));
@@ -94,7 +94,8 @@ impl Jobs {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Lays a job down: its request and the uploaded files, under names of ours. It is on the disk when this returns.
+    /// Stores a job: its request and the uploaded files, under the server's names. It is on the disk when this
+    /// returns.
     pub fn add(&self, kind: JobKind, request: &[u8], files: &[(&str, &[u8])]) -> Answer<Arc<Job>> {
         if self.ends.load(Ordering::SeqCst) {
             return Err(ApiError::plain(
@@ -141,7 +142,7 @@ impl Jobs {
         ))
     }
 
-    /// Removes the oldest finished jobs beyond those that are kept.
+    /// Removes the oldest finished jobs above the number that is kept.
     fn forget_old(&self) {
         let finished: Vec<Arc<Job>> =
             self.state().by_number.values().filter(|job| job.state().is_final()).cloned().collect();
@@ -152,7 +153,7 @@ impl Jobs {
 
     fn forget(&self, job: &Job) {
         self.state().remove(job);
-        // Away as a whole first: killed halfway, it is not half a job.
+        // Rename the folder first, so that an interrupted removal does not leave half a job.
         let gone = self.folder.join(format!(".{}.gone", job.id));
         if std::fs::rename(&job.folder, &gone).is_ok() {
             let _ = std::fs::remove_dir_all(&gone);
@@ -170,7 +171,7 @@ impl Jobs {
         Ok(())
     }
 
-    /// A job by its id, which is compared with those there are and nothing else.
+    /// A job by its id, which is only compared with the existing ids.
     pub fn get(&self, id: &str) -> Answer<Arc<Job>> {
         self.state().by_id.get(id).cloned().ok_or_else(|| {
             ApiError::field(
@@ -195,10 +196,10 @@ impl Jobs {
             .then(|| state.waiting().take_while(|j| j.number < job.number).count())
     }
 
-    /// Cancels a job: at once where it waits, at its next step where it runs, not at all where it is finished.
+    /// Cancels a job: immediately if it waits, at its next step if it runs; a finished job does not change.
     pub fn cancel(&self, id: &str) -> Answer<Arc<Job>> {
         let job = self.get(id)?;
-        // With the lock, so that no worker takes it meanwhile.
+        // Holding the lock, so that no worker takes it meanwhile.
         let state = self.state();
         job.cancelled.store(true, Ordering::SeqCst);
         if job.state() == JobState::Queued {
@@ -212,7 +213,7 @@ impl Jobs {
         Ok(job)
     }
 
-    /// Starts workers, which go on until [`Jobs::end`].
+    /// Starts workers, which run until [`Jobs::end`].
     pub fn start(self: &Arc<Jobs>, workers: usize, run: Arc<Run>) -> Vec<JoinHandle<()>> {
         let worker = |_| {
             let (jobs, run) = (self.clone(), run.clone());
@@ -225,10 +226,10 @@ impl Jobs {
         (0..workers).map(worker).collect()
     }
 
-    /// Asks the workers to end after their present step.
+    /// Asks the workers to end after their current step.
     pub fn end(&self) {
         self.ends.store(true, Ordering::SeqCst);
-        // With the lock, so that no worker is between looking and waiting.
+        // Holding the lock, so that no worker is between checking and waiting.
         drop(self.state());
         self.changed.notify_all();
     }
@@ -247,7 +248,7 @@ impl Jobs {
             }
             let first = state.waiting().next().cloned();
             if let Some(job) = first {
-                // Where the disk is full it runs all the same, and the error comes with the result.
+                // If the disk is full the job runs nevertheless, and the error is reported with the result.
                 let _ = job.change(|record| {
                     record.state = JobState::Running;
                     record.started = Some(now());
@@ -293,7 +294,7 @@ impl Jobs {
                 }
             }
         });
-        // A record that the disk does not take: the client has it from memory, and the job runs again after a restart.
+        // If the record cannot be written, clients get it from memory, and the job runs again after a restart.
         drop(changed);
     }
 }
@@ -303,7 +304,7 @@ fn keep_result(folder: &Path, value: &serde_json::Value) -> Answer<()> {
     write_atomically(&folder.join("result.json"), &text).map_err(|e| ApiError::system("the result", e))
 }
 
-/// A job that an earlier server left.
+/// A job left by an earlier server.
 fn found(folder: PathBuf, id: String) -> Job {
     let record = JobRecord::read(&folder).map_err(|what| format!("job.json: {what}"));
     let record =
@@ -327,7 +328,7 @@ fn found(folder: PathBuf, id: String) -> Job {
         } else {
             (record.state, record.started) = (JobState::Queued, None);
         }
-        // Where the disk does not take it, it is decided again after the next start.
+        // If it cannot be written, this is decided again at the next start.
         let _ = record.write(&folder);
     }
     Job::new(record, folder)
@@ -415,7 +416,7 @@ mod tests {
         let (first, second) = {
             let jobs = open(dir.path());
             let (first, second) = (add(&jobs), add(&jobs));
-            // As a killed process leaves them.
+            // As after a killed process.
             assert_eq!(jobs.next().unwrap().id, first.id);
             std::fs::create_dir(jobs.folder.join(".0123.new")).unwrap();
             (first.id.clone(), second.id.clone())
@@ -433,7 +434,7 @@ mod tests {
         assert!(record.error.unwrap().error.contains("3 times"));
         let workers = jobs.start(1, Arc::new(|_: &mut Work<'_>| Ok(json!({}))));
         assert_eq!(wait(&jobs.get(&second).unwrap()).state, JobState::Done);
-        // New numbers follow the old ones.
+        // Numbers continue after the old ones.
         assert_eq!(add(&jobs).number, 3);
         end(jobs, workers);
     }
@@ -474,7 +475,7 @@ mod tests {
             jobs.cancel(&job.id).unwrap();
             assert_eq!(wait(job).state, JobState::Cancelled);
         }
-        // Three finished ones are kept: the oldest goes when another comes.
+        // Three finished jobs are kept: the oldest is removed when another one finishes.
         let last = add(&jobs);
         assert_eq!(jobs.get(&all[0].id).unwrap_err().status, StatusCode::NOT_FOUND);
         assert!(!all[0].folder.exists() && all[1].folder.exists());

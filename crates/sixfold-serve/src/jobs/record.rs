@@ -1,4 +1,4 @@
-//! One job: its state on disk and in memory, and who is told of changes.
+//! One job: its state on disk and in memory, and notification of changes.
 
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
@@ -11,7 +11,7 @@ use utoipa::ToSchema;
 
 use crate::error::Problem;
 
-/// The only version of `job.json` there is.
+/// The only version of `job.json`.
 const VERSION: u32 = 1;
 
 /// What a job does.
@@ -68,7 +68,7 @@ pub(crate) struct Progress {
 pub(crate) struct JobRecord {
     pub version: u32,
     pub id: String,
-    /// Jobs are worked on in this order.
+    /// Jobs are processed in the order of this number.
     pub number: u64,
     pub kind: JobKind,
     pub state: JobState,
@@ -77,12 +77,12 @@ pub(crate) struct JobRecord {
     pub created: f64,
     pub started: Option<f64>,
     pub finished: Option<f64>,
-    /// How often a worker began with it.
+    /// How many times a worker has started it.
     pub attempts: u32,
     /// Whether there is an image of the result.
     pub overlay: bool,
     pub error: Option<Problem>,
-    /// The status that goes with the error, when it is that of a request.
+    /// The HTTP status of the error, if it is an error of the request.
     pub error_status: Option<u16>,
 }
 
@@ -105,7 +105,7 @@ impl JobRecord {
         }
     }
 
-    /// Reads the record in a job's folder; what is wrong with it otherwise.
+    /// Reads the record in a job's folder; the error describes what is wrong with it.
     pub fn read(folder: &Path) -> Result<JobRecord, String> {
         let path = folder.join("job.json");
         let text = sixfold_io::read_regular_text(&path, sixfold_io::limits::SMALL_TEXT);
@@ -138,7 +138,7 @@ pub(crate) struct Job {
     pub folder: PathBuf,
     /// Set once a client has asked to stop.
     pub cancelled: AtomicBool,
-    /// The record; whoever watches is told of every change.
+    /// The record; watchers are notified of every change.
     pub record: watch::Sender<JobRecord>,
 }
 
@@ -157,7 +157,7 @@ impl Job {
         self.record.borrow().state
     }
 
-    /// Changes the record, in memory and on disk. Clients learn of it once the disk has it.
+    /// Changes the record, in memory and on disk. Clients are notified after it was written to disk.
     pub fn change(&self, change: impl FnOnce(&mut JobRecord)) -> std::io::Result<()> {
         let mut record = self.record.borrow().clone();
         change(&mut record);

@@ -1,4 +1,5 @@
-//! What a task is given while it is worked on: its folder, where to report progress, whether to go on.
+//! The interface between a running task and the server: the job's folder, progress reports, and requests to
+//! stop.
 
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -15,7 +16,7 @@ use crate::error::ApiError;
 pub(crate) enum Stopped {
     /// A client cancelled it.
     Cancelled,
-    /// The server ends: the job waits for the next one.
+    /// The server ends; the job waits for the next server.
     ServerEnds,
     /// It failed.
     Failed(ApiError),
@@ -27,7 +28,7 @@ impl From<ApiError> for Stopped {
     }
 }
 
-/// A job while it is worked on.
+/// A job while it is processed.
 pub(crate) struct Work<'a> {
     pub(super) job: &'a Job,
     pub(super) server_ends: &'a AtomicBool,
@@ -48,15 +49,15 @@ impl Work<'_> {
         &self.job.folder
     }
 
-    /// Tells clients how far it is, and ends the task where nobody waits for it any more.
+    /// Reports progress to clients, and ends the task if it was cancelled or the server ends.
     pub fn step(&self, done: usize, total: usize, step: impl Into<String>) -> Result<(), Stopped> {
         let progress = Progress { done, total, step: step.into() };
-        // In memory alone: after a restart the job begins again.
+        // Only in memory: after a restart the job starts from the beginning.
         self.job.record.send_modify(|record| record.progress = progress);
         self.check()
     }
 
-    /// Ends the task where nobody waits for it any more, or it takes too long.
+    /// Ends the task if it was cancelled, the server ends, or it takes too long.
     pub fn check(&self) -> Result<(), Stopped> {
         if self.job.cancelled.load(Ordering::SeqCst) {
             return Err(Stopped::Cancelled);

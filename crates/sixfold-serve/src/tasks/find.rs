@@ -21,7 +21,7 @@ use crate::images::{ImageBytes, Images};
 use crate::jobs::{Accepted, JobView, Stopped, Work};
 use crate::methods::{SharedObject, of_estimator};
 
-/// Most objects of one request.
+/// Maximum number of objects of one request.
 const MAX_OBJECTS: usize = 100;
 const MAX_INSTANCES: usize = 1000;
 
@@ -43,7 +43,7 @@ const RULE: FormRule = FormRule {
     ],
 };
 
-/// What is asked for, beside the images.
+/// The request without the images.
 #[derive(Debug, Serialize, Deserialize)]
 pub(crate) struct FindRequest {
     method: String,
@@ -151,7 +151,7 @@ impl FindRequest {
         })
     }
 
-    /// Whether a worker could work on it.
+    /// Checks that a worker can process the request.
     fn check(&self, app: &App, bytes: &ImageBytes) -> Answer<()> {
         let estimator = app.methods.estimator(&self.method)?;
         if self.objects.is_empty() || self.objects.len() > MAX_OBJECTS {
@@ -210,7 +210,7 @@ impl FindRequest {
         Ok(())
     }
 
-    /// Where to look, in the image without distortion.
+    /// The region of the search, in the image without distortion.
     fn region(&self, images: &Images) -> Answer<Option<Region>> {
         let lens = &images.lens;
         let boxed = self.region.map(|[x, y, width, height]| Rect { x, y, width, height });
@@ -241,7 +241,7 @@ impl FindRequest {
                 "mark the object's pixels; together with a box they have to meet it",
             )
         })?;
-        // Of a distorted image it fits no pixel of the pinhole image exactly: its box has to do.
+        // A mask of a distorted image does not match the pixels of the pinhole image: use its box.
         let exact = lens.distortion.is_none();
         Ok(Some(if exact { region } else { Region::of_box(undistorted(&region.bbox, lens)) }))
     }
@@ -259,7 +259,7 @@ fn given_box(form: &Form) -> Answer<Option<[f64; 4]>> {
     if good { Ok(Some(numbers)) } else { Err(wrong()) }
 }
 
-/// The box that holds what a box of the raw image shows, in the pinhole image.
+/// The box in the pinhole image that contains the content of a box in the raw image.
 fn undistorted(bbox: &Rect, lens: &Camera) -> Rect {
     if lens.distortion.is_none() {
         return *bbox;
@@ -278,7 +278,7 @@ fn undistorted(bbox: &Rect, lens: &Camera) -> Rect {
     Rect { x: low.x, y: low.y, width: high.x - low.x, height: high.y - low.y }
 }
 
-/// Works on a request.
+/// Processes a request.
 pub(super) fn run(app: &App, request: &FindRequest, work: &mut Work<'_>) -> Result<Value, Stopped> {
     let began = Instant::now();
     let images = Images::decode(&ImageBytes::of_folder(work.folder())?, request.depth_scale)?;
@@ -331,7 +331,7 @@ pub(super) fn run(app: &App, request: &FindRequest, work: &mut Work<'_>) -> Resu
     Ok(result)
 }
 
-/// Searches one object that is prepared now, or was before.
+/// Searches one object, which is prepared now or was prepared before.
 fn search(
     app: &App,
     image: &ImageRun<'_>,
@@ -348,7 +348,7 @@ fn search(
     Ok(FoundObject { object, estimates, seconds: began.elapsed().as_secs_f64() })
 }
 
-/// The poses as `sixfold estimate --json` has them, with the colour of each in the overlay and the camera that they are for.
+/// The poses in the form of `sixfold estimate --json`, with the colour of each in the overlay and the camera.
 fn report(image: &ImageRun<'_>, found: &[FoundObject], camera: &Camera) -> Answer<Value> {
     let report = image.report(found);
     let fault = |e: serde_json::Error| ApiError::system("the result", e);

@@ -27,7 +27,7 @@ const RULE: FormRule = FormRule {
     texts: &["fx", "fy", "cx", "cy", "depth_scale", "gripper", "number", "seen_only"],
 };
 
-/// What is asked for, beside the images.
+/// The request without the images.
 #[derive(Debug, Serialize, Deserialize)]
 pub(crate) struct GraspRequest {
     depth_scale: Option<f64>,
@@ -150,7 +150,7 @@ impl GraspRequest {
     }
 }
 
-/// Works on a request.
+/// Processes a request.
 pub(super) fn run(request: &GraspRequest, work: &mut Work<'_>) -> Result<Value, Stopped> {
     let began = Instant::now();
     let gripper = request.gripper()?;

@@ -1,4 +1,4 @@
-//! What jobs do. A request is checked when it arrives and written down; a worker reads it again and works on it.
+//! The tasks of jobs. A request is checked when it arrives and is stored; later a worker reads and processes it.
 
 pub(crate) mod find;
 pub(crate) mod grasps;
@@ -25,7 +25,7 @@ pub(crate) enum Request {
 }
 
 impl Request {
-    /// Makes it a job with these files.
+    /// Stores the request as a job with these files.
     pub fn lay_down(&self, app: &App, files: &[(&str, &[u8])]) -> Answer<Arc<Job>> {
         let kind = match self {
             Request::Find(_) => JobKind::Find,
@@ -39,7 +39,7 @@ impl Request {
     }
 }
 
-/// Works on a job.
+/// Processes a job.
 pub(crate) fn run(app: &App, work: &mut Work<'_>) -> Result<serde_json::Value, Stopped> {
     let read = read_regular(&work.folder().join("request.json"), limits::SMALL_TEXT);
     let bytes = read.map_err(|e| ApiError::system("the job's request", e))?;

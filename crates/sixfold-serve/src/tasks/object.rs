@@ -22,7 +22,7 @@ use crate::form::{Form, FormRule, UploadedFile};
 use crate::jobs::{Accepted, JobView, Stopped, Work};
 use crate::objects::SymmetryView;
 
-/// Most files beside a mesh: materials and textures.
+/// Maximum number of additional files of a mesh: materials and textures.
 const MAX_RESOURCES: usize = 50;
 
 const RULE: FormRule = FormRule {
@@ -31,23 +31,23 @@ const RULE: FormRule = FormRule {
     texts: &["name", "unit", "turns_about", "find_symmetries", "noise", "replace"],
 };
 
-/// What is to be stored, beside the files.
+/// The request without the files.
 #[derive(Debug, Serialize, Deserialize)]
 pub(crate) struct ObjectRequest {
     name: String,
-    /// What the client calls the mesh file; for messages and the record.
+    /// The client's name of the mesh file; for messages and the record.
     file_name: String,
     format: Format,
     unit: Unit,
     turns_about: Option<Axis>,
-    /// By which evidence symmetries are found and stored.
+    /// The evidence by which symmetries are found and stored.
     #[serde(default)]
     find_symmetries: Option<Evidence>,
     /// Noise of the surface, standard deviation in metres.
     #[serde(default)]
     noise: f64,
     replace: bool,
-    /// What the client calls the files beside the mesh; file `i` is `resource-i` in the job's folder.
+    /// The client's names of the additional files; file `i` is `resource-i` in the job's folder.
     resources: Vec<String>,
 }
 
@@ -169,7 +169,7 @@ impl ObjectRequest {
         })
     }
 
-    /// The mesh in metres. What it names beside itself is looked for among the uploaded files, by `resource`, and nowhere else.
+    /// The mesh in metres. Files that it refers to are searched only among the uploaded files, by `resource`.
     fn mesh(&self, bytes: &[u8], resource: &dyn Fn(usize) -> std::io::Result<Vec<u8>>) -> Answer<Mesh> {
         let parse = match self.format {
             Format::Ply => parse_ply,
@@ -200,7 +200,7 @@ impl ObjectRequest {
         Ok(mesh)
     }
 
-    /// What is stored of the mesh, and all symmetries that were found in it.
+    /// The mesh's data for the store, and all symmetries found in it.
     fn info(&self, mesh: &Mesh) -> Answer<(ModelInfo, Vec<FoundSymmetry>)> {
         let mut info = ModelInfo::of_mesh(mesh);
         let mut found = vec![];
@@ -226,7 +226,7 @@ impl ObjectRequest {
     }
 }
 
-/// A text that is one of a few, if it was sent.
+/// One of several fixed values of a text field, if it was sent.
 fn one_of<T: Copy>(form: &Form, name: &str, all: &[(&str, T)], expected: &str) -> Answer<Option<T>> {
     let Some(text) = form.text(name)? else { return Ok(None) };
     match all.iter().find(|(word, _)| *word == text) {
@@ -235,7 +235,7 @@ fn one_of<T: Copy>(form: &Form, name: &str, all: &[(&str, T)], expected: &str) -
     }
 }
 
-/// Whether an object could be stored under a name now.
+/// Checks that an object can be stored under a name now.
 pub(crate) fn check_new_name(app: &App, name: &str, replace: bool) -> Answer<()> {
     match app.store.record(name) {
         Err(error @ StoreError::Name(_)) => Err(ApiError::of_store("name", &error)),
@@ -248,7 +248,7 @@ pub(crate) fn check_new_name(app: &App, name: &str, replace: bool) -> Answer<()>
 }
 
 impl Format {
-    /// By the ending of a file's name.
+    /// The format by the extension of a file's name.
     fn of(name: &str) -> Answer<Format> {
         let ending = name.rsplit_once('.').map(|(_, ending)| ending.to_ascii_lowercase());
         Ok(match ending.as_deref() {
@@ -269,7 +269,7 @@ impl Format {
     }
 }
 
-/// Works on a request.
+/// Processes a request.
 pub(super) fn run(app: &App, request: &ObjectRequest, work: &mut Work<'_>) -> Result<Value, Stopped> {
     let folder = work.folder().to_owned();
     let read = |name: &str| read_regular(&folder.join(name), limits::MESH);
@@ -285,7 +285,7 @@ pub(super) fn run(app: &App, request: &ObjectRequest, work: &mut Work<'_>) -> Re
         Ok(())
     });
     match stored {
-        // Stored by this job before the server ended, which began it again.
+        // It was stored by this job before the server ended and the job was started again.
         Err(StoreError::Exists { .. }) if is_stored(app, request, &record) => {}
         other => other.map_err(|e| ApiError::of_store("name", &e))?,
     }

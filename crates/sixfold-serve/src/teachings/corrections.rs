@@ -1,4 +1,5 @@
-//! What a person says of a photograph: its pose, its mask, whether to use it. Only what depends on it is made again.
+//! A person's corrections of a photograph: its pose, its mask, whether to use it. Only results that depend on them are computed
+//! again.
 
 use axum::Json;
 use axum::body::Bytes;
@@ -18,7 +19,7 @@ use super::views::TeachingView;
 use crate::app::{App, Shared};
 use crate::error::{Answer, ApiError, Problem};
 
-/// Most marked points.
+/// Maximum number of marked points.
 const MAX_PAIRS: usize = 100;
 /// The camera is within this distance of the board's centre, metres.
 const REACH: f64 = 10.0;
@@ -73,7 +74,7 @@ fn changed(
     change: impl FnOnce(&mut Teaching, usize) -> Answer<()>,
 ) -> Answer<Json<TeachingView>> {
     let (entry, number) = (app.teachings.get(id)?, number(text)?);
-    // Whether there is such a photograph, before anything is locked.
+    // Check that the photograph exists before anything is locked.
     entry.snapshot()?.photograph_file(number).map_err(|e| of_teach(&e))?;
     entry.change(app, &Default::default(), |teaching| change(teaching, number))?;
     Ok(Json(TeachingView::of(app, &entry)?))
@@ -187,10 +188,10 @@ pub(crate) async fn set_mask(
     .await
 }
 
-/// A mask of a smaller image of the same proportions in the photograph's size.
+/// A mask of a smaller image with the same aspect ratio, enlarged to the photograph's size.
 fn enlarged(mask: &Mask, (width, height): (usize, usize)) -> Option<Mask> {
     let (w, h) = mask.size();
-    // Sides are whole pixels: the shorter one may be half a pixel off.
+    // Sides are whole pixels, so the shorter one may be rounded by half a pixel.
     let same =
         |a: usize, b: usize, c: usize, d: usize| (a as f64 * d as f64 / c as f64 - b as f64).abs() <= 0.51;
     let good = w <= width && h <= height && (same(w, h, width, height) || same(h, w, height, width));

@@ -1,4 +1,4 @@
-//! The forms of teachings: photographs with what is known of them, checked as they arrive.
+//! The forms of teachings: photographs with their data, checked when they arrive.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -67,7 +67,7 @@ pub(crate) struct MoreForm {
     ruler: Option<f64>,
 }
 
-/// What a form brings: photographs by their names, each perhaps with depth.
+/// The content of a form: photographs by name, some with depth.
 pub(super) struct Given<'f> {
     photographs: Vec<(&'f UploadedFile, Option<&'f UploadedFile>)>,
     /// Metres per unit of depth.
@@ -76,7 +76,7 @@ pub(super) struct Given<'f> {
 }
 
 impl<'f> Given<'f> {
-    /// Everything is decoded once before anything is kept. `of_camera` is the size of photographs that are there already.
+    /// Decodes everything once before anything is stored. `there` is the size of photographs that exist already.
     pub fn of_form(form: &'f Form, there: Option<(usize, usize)>) -> Answer<Given<'f>> {
         let photographs = by_name(form.files("photographs"))?;
         let depth = by_name(form.files("depth"))?;
@@ -123,7 +123,7 @@ impl<'f> Given<'f> {
         self.photographs.len()
     }
 
-    /// Puts the photographs into a teaching.
+    /// Adds the photographs to a teaching.
     pub fn into(self, teaching: &mut Teaching) -> Answer<()> {
         for (photograph, depth) in self.photographs {
             let number = teaching.add_photograph(&photograph.name, &photograph.bytes);
@@ -137,7 +137,7 @@ impl<'f> Given<'f> {
     }
 }
 
-/// Files in the order of their names, of which each is there once.
+/// Files in the order of their names, which must be unique.
 fn by_name(files: &[UploadedFile]) -> Answer<Vec<&UploadedFile>> {
     let mut sorted: Vec<&UploadedFile> = files.iter().collect();
     sorted.sort_by(|a, b| a.name.cmp(&b.name));

@@ -1,4 +1,4 @@
-//! `/v1/teachings`: begun, listed, shown, run, accepted, removed.
+//! `/v1/teachings`: create, list, show, run, accept and remove teachings.
 
 use axum::Json;
 use axum::body::Bytes;
@@ -58,7 +58,7 @@ pub(crate) async fn add_teaching(
         let starts = form.parsed("start", "true or false")?.unwrap_or(true);
         let entry = laid_down(app, &form)?;
         if starts {
-            // Where too many jobs wait, it is run later: the photographs are kept.
+            // If too many jobs wait, it can be run later: the photographs are kept.
             if let Err(error) = entry.start(app, TeachRequest::run(&entry.id)) {
                 entry.note(|record| record.problem = Some(*error.problem))?;
             }
@@ -223,7 +223,7 @@ pub(crate) async fn accept_teaching(
         }
         let record = entry.record();
         let name = body.name.unwrap_or(record.name);
-        // What this teaching stored before is its own.
+        // An object that this teaching stored earlier may be replaced.
         let own = record.object.as_ref() == Some(&name);
         let replace = own || body.replace.unwrap_or(record.replace);
         check_new_name(app, &name, replace)?;

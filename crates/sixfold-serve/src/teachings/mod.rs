@@ -1,7 +1,7 @@
-//! Teachings: objects that are learnt from photographs on the board, a folder each, with the functions of `sixfold teach`.
+//! Teachings: objects that are taught from photographs on the board, one folder each, with the functions of `sixfold teach`.
 //!
-//! `DATA/teachings/ID` holds `record.json` (the server's part) and what [`sixfold_teach::Teaching`] keeps there. Readers take a
-//! [`Snapshot`]; one job or one correction at a time changes it. A job that is stopped resumes at the step that it was in.
+//! `DATA/teachings/ID` holds `record.json` (the server's part) and the files of [`sixfold_teach::Teaching`]. Readers take a
+//! [`Snapshot`]; one job or one correction at a time changes the folder. A job that was stopped resumes at its last step.
 
 mod corrections;
 mod form;
@@ -31,12 +31,12 @@ use crate::objects::SymmetryView;
 use crate::options::ServerOptions;
 use views::MeshFacts;
 
-/// The only version of `record.json` there is.
+/// The only version of `record.json`.
 const VERSION: u32 = 1;
-/// Most teachings that are kept.
+/// Maximum number of teachings that are kept.
 const MAX_TEACHINGS: usize = 1000;
 
-/// `record.json`: what the server knows of a teaching beside its folder.
+/// `record.json`: the server's data of a teaching besides its folder.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Record {
@@ -46,15 +46,15 @@ pub(crate) struct Record {
     replace: bool,
     /// Seconds since 1970.
     created: f64,
-    /// The job that worked on it last.
+    /// The last job of this teaching.
     job: Option<String>,
-    /// Why that one failed.
+    /// Why the last job failed.
     problem: Option<Problem>,
     mesh: Option<MeshFacts>,
     symmetries: Vec<SymmetryView>,
-    /// The stored object that was made of it last.
+    /// The object that was last stored from it.
     object: Option<String>,
-    /// Whether that one is as the mesh is now.
+    /// Whether the stored object corresponds to the current mesh.
     accepted: bool,
 }
 
@@ -63,7 +63,7 @@ pub(crate) struct Entry {
     pub id: String,
     pub folder: PathBuf,
     record: Mutex<Record>,
-    /// Held by whoever changes the folder.
+    /// Locked while the folder is changed.
     changing: Mutex<()>,
 }
 
@@ -88,7 +88,7 @@ impl Entry {
         Snapshot::read(&self.folder).map_err(|e| of_teach(&e))
     }
 
-    /// The job that waits or works on it.
+    /// The waiting or running job of this teaching.
     fn active(&self, app: &App) -> Option<Arc<Job>> {
         self.last_job(app).filter(|job| !job.state().is_final())
     }
@@ -97,7 +97,7 @@ impl Entry {
         locked(&self.record).job.as_deref().and_then(|id| app.jobs.get(id).ok())
     }
 
-    /// The right to change it, unless a job waits or works on it.
+    /// The lock for changes, unless a job waits or runs.
     fn free(&self, app: &App) -> Answer<MutexGuard<'_, ()>> {
         let busy = || {
             let advice = "wait for its job, or cancel that first";
@@ -111,7 +111,7 @@ impl Entry {
         if self.active(app).is_some() { Err(busy()) } else { Ok(held) }
     }
 
-    /// Changes the folder, unless a job waits or works on it. What was accepted is then no longer what the folder says.
+    /// Changes the folder, unless a job waits or runs. The accepted object then no longer corresponds to the folder.
     fn change<T>(
         &self,
         app: &App,
@@ -125,7 +125,7 @@ impl Entry {
         Ok(changed)
     }
 
-    /// Lays down a job for it.
+    /// Adds a job for it.
     fn start(&self, app: &App, request: TeachRequest) -> Answer<Arc<Job>> {
         let _held = self.free(app)?;
         let job = crate::tasks::Request::Teach(request).lay_down(app, &[])?;
@@ -149,7 +149,7 @@ pub(crate) struct Teachings {
 }
 
 impl Teachings {
-    /// Those in `DATA/teachings`. Folders without a readable record are left alone.
+    /// Opens the teachings in `DATA/teachings`. Folders without a readable record are ignored.
     pub fn open(options: &ServerOptions) -> Result<Teachings, ServeError> {
         let folder = options.data.join("teachings");
         let io = |source| ServeError::Io { path: folder.clone(), source };
@@ -160,7 +160,7 @@ impl Teachings {
             let name = path.file_name().and_then(|n| n.to_str()).unwrap_or_default().to_owned();
             let hidden = name.strip_prefix('.').and_then(|n| n.split_once('.')).map(|(id, _)| id);
             if hidden.is_some_and(is_id) && path.is_dir() {
-                // One that was being laid down, or removed, when the server ended.
+                // One that was being stored or removed when the server ended.
                 let _ = std::fs::remove_dir_all(&path);
             } else if is_id(&name)
                 && let Some(record) = read_record(&path)
@@ -171,7 +171,7 @@ impl Teachings {
         Ok(Teachings { folder, all: Mutex::new(all), segmenter: Mutex::new(None) })
     }
 
-    /// A teaching by its id, which is compared with those there are and nothing else.
+    /// A teaching by its id, which is only compared with the existing ids.
     pub fn get(&self, id: &str) -> Answer<Arc<Entry>> {
         locked(&self.all).get(id).cloned().ok_or_else(|| {
             ApiError::field(
@@ -191,7 +191,7 @@ impl Teachings {
         all
     }
 
-    /// Lays one down: `fill` puts the photographs into its folder. It is on the disk as a whole, or not at all.
+    /// Stores a new teaching: `fill` puts the photographs into its folder. It is stored as a whole or not at all.
     fn add(&self, record: Record, fill: impl FnOnce(&Path) -> Answer<()>) -> Answer<Arc<Entry>> {
         if locked(&self.all).len() >= MAX_TEACHINGS {
             let message = format!("there are {MAX_TEACHINGS} teachings, the limit");
@@ -225,7 +225,7 @@ impl Teachings {
         let entry = self.get(id)?;
         let _held = entry.free(app)?;
         locked(&self.all).remove(id);
-        // Away as a whole first: killed halfway, it is not half a teaching.
+        // Rename the folder first, so that an interrupted removal does not leave half a teaching.
         let gone = self.folder.join(format!(".{id}.gone"));
         std::fs::rename(&entry.folder, &gone).map_err(|e| ApiError::system("the teaching", e))?;
         let _ = std::fs::remove_dir_all(&gone);
@@ -254,7 +254,7 @@ fn read_record(folder: &Path) -> Option<Record> {
     (record.version == VERSION).then_some(record)
 }
 
-/// What the library says of photographs, as a client reads it. Where files lie on this machine is nobody's business.
+/// An error of the library as an answer to the client, without paths of this machine.
 pub(crate) fn of_teach(error: &TeachError) -> ApiError {
     let photographs = |expected: &str, advice: &str| ApiError::about("photographs", error, expected, advice);
     let sides = "photographs of one object on the printed board, from all sides";

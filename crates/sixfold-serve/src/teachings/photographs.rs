@@ -18,7 +18,7 @@ use crate::error::{Answer, ApiError, Problem};
 use crate::images::png;
 use crate::objects::{MeshDetail, faces_of, mesh_ply};
 
-/// Sides of images, pixels: as they are sent, and what may be asked for.
+/// Sides of images, pixels: the default, and the range that may be requested.
 const SIDE: usize = 1280;
 const SIDES: std::ops::RangeInclusive<usize> = 64..=2048;
 const QUALITY: u8 = 88;
@@ -73,7 +73,7 @@ async fn sent(
     .await
 }
 
-/// An answer that a browser keeps where its address names this state.
+/// An answer that a browser may cache if the address contains the current revision.
 fn kept_while(same: bool, content_type: &'static str, bytes: Vec<u8>) -> Response {
     let cache = if same { "private, max-age=86400" } else { "no-store" };
     ([(CONTENT_TYPE, content_type), (CACHE_CONTROL, cache)], bytes).into_response()

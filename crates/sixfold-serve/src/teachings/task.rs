@@ -1,4 +1,4 @@
-//! Works on a teaching: tags, masks, mesh, as `sixfold teach` does; then, once somebody has accepted it, stores the object.
+//! Processes a teaching: tags, masks, mesh, as `sixfold teach` does; stores the object once a person has accepted it.
 
 use std::sync::{Mutex, PoisonError};
 
@@ -22,7 +22,7 @@ pub(crate) struct TeachRequest {
     accept: Option<AcceptedAs>,
 }
 
-/// What the object is stored as.
+/// The name under which the object is stored, and whether it replaces another.
 #[derive(Debug, Serialize, Deserialize)]
 struct AcceptedAs {
     name: String,
@@ -39,7 +39,7 @@ impl TeachRequest {
     }
 }
 
-/// Works on a request. What failed is kept with the teaching, also after the job is gone.
+/// Processes a request. An error is kept with the teaching, also after the job was removed.
 pub(crate) fn run(app: &App, request: &TeachRequest, work: &mut Work<'_>) -> Result<Value, Stopped> {
     let entry = app.teachings.get(&request.teaching)?;
     let _held = locked(&entry.changing);
@@ -55,7 +55,7 @@ pub(crate) fn run(app: &App, request: &TeachRequest, work: &mut Work<'_>) -> Res
     result
 }
 
-/// Runs a step that reports how far it is; it ends where nobody waits for the job any more.
+/// Runs a step that reports progress; it ends if the job was cancelled or the server ends.
 fn step(
     work: &Work<'_>,
     name: &str,
@@ -79,7 +79,7 @@ fn step(
     }
 }
 
-/// Too few photographs are told before anything is looked for in them.
+/// Reports too few photographs before anything is searched in them.
 fn check_number(teaching: &Teaching) -> Result<(), TeachError> {
     let used = || teaching.photographs().iter().filter(|p| !p.left_out_by_person);
     let least = if used().any(|p| p.depth.is_some()) { FEWEST_WITH_DEPTH } else { FEWEST_PHOTOGRAPHS };
@@ -128,7 +128,7 @@ fn teach(app: &App, entry: &Entry, work: &mut Work<'_>) -> Result<Value, Stopped
 fn accept(app: &App, entry: &Entry, accepted: &AcceptedAs, work: &mut Work<'_>) -> Result<Value, Stopped> {
     let known = entry.snapshot()?;
     work.step(0, 1, "storing the object")?;
-    // Stored by this job before the server ended, which began it again.
+    // It was stored by this job before the server ended and the job was started again.
     let own = entry.record().object.as_ref() == Some(&accepted.name);
     let replace = accepted.replace || own;
     let name = &accepted.name;

@@ -1,4 +1,4 @@
-//! Teachings as clients see them.
+//! Teachings in the form for clients.
 
 use serde::{Deserialize, Serialize};
 use sixfold_mesh::Mesh;
@@ -171,7 +171,7 @@ pub(crate) struct TeachingLinks {
 
 impl TeachingView {
     pub fn of(app: &App, entry: &Entry) -> Answer<TeachingView> {
-        // The job first: what it has finished meanwhile is then in what is read.
+        // Read the job first, so that the results of a job that finishes meanwhile are included.
         let job = entry.last_job(app);
         let (record, known) = (entry.record(), entry.snapshot()?);
         let state = match job.as_ref().map(|job| job.state()) {

@@ -1,4 +1,4 @@
-//! Who may ask: tokens, names of other machines, pages of other origins; and the pages themselves.
+//! Access control: tokens, names of other machines, pages of other origins; and the pages themselves.
 
 use sixfold_serve::{Server, ServerOptions};
 
@@ -15,7 +15,7 @@ fn a_token_is_asked_for_and_its_cookie_does() {
     get(&[("Authorization", "Bearer 0123456789abcdeX")]).expect(401);
     get(&[("Authorization", "Bearer 0123456789abcdef")]).expect(200);
     frame().text("objects", "duck").post(server.address, "/v1/find").expect(401);
-    // Pages and health need none.
+    // Pages and health need no token.
     for path in ["/", "/find", "/v1/health", "/static/app.css"] {
         server.get(path).expect(200);
     }
@@ -27,7 +27,7 @@ fn a_token_is_asked_for_and_its_cookie_does() {
     assert!(line.contains("HttpOnly") && line.contains("SameSite=Strict") && !line.contains(TOKEN), "{line}");
     let cookie = line.split_once(' ').unwrap().1.split(';').next().unwrap();
     get(&[("Cookie", cookie)]).expect(200);
-    // With a token, the server may be asked by any name.
+    // With a token, the server can be addressed by any name.
     get(&[("Cookie", cookie), ("Host", "robot.example")]).expect(200);
 }
 

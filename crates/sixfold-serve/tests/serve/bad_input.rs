@@ -39,7 +39,7 @@ fn camera(form: Form) -> Form {
     form.file("camera", "camera.json", &read("camera.json"))
 }
 
-/// A PNG whose header says a size, with a right checksum, before the rest of another file.
+/// A PNG whose header states a size, with a right checksum, followed by the rest of another file.
 fn lying_png(width: u32, height: u32) -> Vec<u8> {
     let mut png = depth();
     png[16..20].copy_from_slice(&width.to_be_bytes());
@@ -255,7 +255,7 @@ fn a_full_queue_and_slow_clients_are_told_so() {
     let form = search("ape,cat,driller,duck");
     let replies: Vec<u16> = (0..6).map(|_| server.post("/v1/find", &form).status).collect();
     assert!(replies.contains(&202) && replies.contains(&429), "{replies:?}");
-    // Half a form, and then nothing.
+    // Half a form, then nothing.
     let mut stream = connect(server.address);
     let head = format!(
         "POST /v1/find HTTP/1.1\r\nHost: {}\r\nContent-Length: 1000\r\nConnection: close\r\n\

@@ -1,10 +1,10 @@
-//! Several clients at once: every answer belongs to its question.
+//! Several clients at once: every answer belongs to its request.
 
 use std::time::{Duration, Instant};
 
 use crate::support::{OBJECTS, TestServer, expected, search};
 
-/// How long clients ask at least.
+/// Minimum time during which clients send requests.
 const LONG_ENOUGH: Duration = Duration::from_secs(4);
 
 #[test]

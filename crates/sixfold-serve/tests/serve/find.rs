@@ -31,10 +31,10 @@ fn objects_are_found_as_without_a_server() {
     assert_eq!(result["camera"]["width"], 640);
     let overlay = server.get(all.last().unwrap()["links"]["overlay"].as_str().unwrap()).expect(200);
     assert_eq!(pixels(&overlay.body), (640, 480));
-    // The same over an open stream of a job that has ended, and in the list.
+    // The same through the event stream of a job that has ended, and in the list.
     assert_eq!(events(server.address, id, |_| ()).len(), 1);
     assert_eq!(server.get("/v1/jobs").expect(200).json()["jobs"][0]["id"], *id);
-    // Numbers in place of a camera file say the same.
+    // Numbers instead of a camera file give the same result.
     let numbers = Form::default()
         .file("depth", "d.png", &read("test/000002/depth/000003.png"))
         .text("fx", "572.4114")
@@ -71,7 +71,7 @@ fn a_box_and_a_mask_say_where_to_look() {
         .map(|i| (found["poses"][0]["camera_from_object"][i][3].as_f64().unwrap() - t(i)).powi(2))
         .sum();
     assert!(moved.sqrt() < 0.01, "{found}");
-    // Where it is not, it is not found.
+    // In a region without the object, it is not found.
     let away = find(search("duck").text("box", "560,400,60,60"));
     assert_eq!(away["not_found"], json!(["duck"]), "{away}");
 }

@@ -13,7 +13,7 @@ fn objects_are_listed_and_rendered() {
     assert_eq!(names, OBJECTS.map(|o| o.0));
     let cat = server.get("/v1/objects/cat").expect(200).json();
     assert!((cat["diameter"].as_f64().unwrap() - 0.1545).abs() < 1e-3, "{cat}");
-    // Where files lie on this machine is nobody's business.
+    // Clients do not get the folders of this machine.
     assert_eq!(cat["source"], "obj_000006.ply");
     let png = server.get("/v1/objects/cat/thumbnail.png").expect(200).body;
     let image = sixfold_io::ImageFile::of_bytes(std::path::Path::new("thumbnail"), &png).rgb().unwrap();
@@ -42,7 +42,7 @@ fn an_uploaded_mesh_is_stored_found_replaced_and_removed() {
     assert_eq!(found["poses"][0]["object"], "my-duck");
     let problem = server.post("/v1/objects", &form).expect(409).json();
     assert_eq!(problem["field"], "name");
-    // Replaced by another mesh, the next request is for that one.
+    // After it was replaced by another mesh, the next request uses the new one.
     let other = read("models/obj_000008.ply");
     let form = Form::default()
         .text("name", "my-duck")

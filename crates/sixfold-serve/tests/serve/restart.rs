@@ -1,4 +1,4 @@
-//! A server that is killed: results stay, what ran or waited is worked on by the next one.
+//! A server that is killed: results stay, and running or waiting jobs are processed by the next server.
 
 use std::io::{BufRead, BufReader};
 use std::net::SocketAddr;
@@ -11,7 +11,7 @@ use sixfold_serve::Server;
 
 const FOLDER: &str = "SIXFOLD_SERVE_TEST_FOLDER";
 
-/// No test: the server that [`what_was_asked_for_survives_a_kill`] starts as a process of its own, and kills.
+/// Not a test: the server that [`what_was_asked_for_survives_a_kill`] starts as a separate process and kills.
 #[test]
 #[ignore = "started by another test"]
 fn serve_until_killed() {
@@ -21,7 +21,7 @@ fn serve_until_killed() {
     server.run_until(&AtomicBool::new(false));
 }
 
-/// A server in a process of its own, and its address.
+/// A server in a separate process, and its address.
 pub fn to_be_killed(folder: &Path) -> (Child, SocketAddr) {
     let mut process = Command::new(std::env::current_exe().unwrap())
         .args(["restart::serve_until_killed", "--exact", "--ignored", "--nocapture"])
@@ -30,7 +30,7 @@ pub fn to_be_killed(folder: &Path) -> (Child, SocketAddr) {
         .spawn()
         .unwrap();
     let lines = BufReader::new(process.stdout.take().unwrap()).lines().map_while(Result::ok);
-    // The harness may have begun the line.
+    // The test harness may have started the line.
     let address = lines.filter_map(|l| l.split_once("address ").map(|(_, a)| a.parse().unwrap())).next();
     (process, address.expect("the server prints its address"))
 }
@@ -65,7 +65,7 @@ fn what_was_asked_for_survives_a_kill() {
         server.result(&waiting).expect(200).json()["poses"][0]["camera_from_object"],
         expected("duck")
     );
-    // Ended in order, too, nothing is lost.
+    // Nothing is lost after an orderly shutdown either.
     let id = search("ape,duck").post(server.address, "/v1/find").expect(202).json();
     let folder = server.end();
     let server = TestServer::within(folder, |o| o);

@@ -12,7 +12,7 @@ use sixfold_mesh::{ModelInfo, ModelsInfo, Unit, read_mesh};
 use sixfold_serve::{Server, ServerOptions};
 use tempfile::TempDir;
 
-/// Objects of the demo's models by the names that they have here.
+/// Objects of the demo's models with their names here.
 pub const OBJECTS: [(&str, u32); 4] = [("ape", 1), ("cat", 6), ("driller", 8), ("duck", 9)];
 
 pub fn demo(path: &str) -> PathBuf {
@@ -23,7 +23,7 @@ pub fn read(path: &str) -> Vec<u8> {
     std::fs::read(demo(path)).unwrap()
 }
 
-/// A store with [`OBJECTS`], their symmetries and nothing derived.
+/// Fills a store with [`OBJECTS`] and their symmetries, without derived data.
 pub fn fill(store: &Path) {
     let infos = ModelsInfo::read(demo("models/models_info.json")).unwrap();
     for (name, id) in OBJECTS {
@@ -41,7 +41,7 @@ pub fn fill(store: &Path) {
     }
 }
 
-/// A server with folders of its own.
+/// A server with its own folders.
 pub struct TestServer {
     pub address: SocketAddr,
     pub folder: TempDir,
@@ -53,7 +53,7 @@ pub fn options(folder: &Path) -> ServerOptions {
 }
 
 impl TestServer {
-    /// With the demo's objects.
+    /// A server with the demo's objects.
     pub fn new() -> TestServer {
         TestServer::with(|options| options)
     }
@@ -64,13 +64,13 @@ impl TestServer {
         TestServer::within(folder, change)
     }
 
-    /// In a folder that a server may have used before.
+    /// A server in a folder that another server may have used before.
     pub fn within(folder: TempDir, change: impl FnOnce(ServerOptions) -> ServerOptions) -> TestServer {
         let server = Server::start(change(options(folder.path()))).unwrap();
         TestServer { address: server.address(), folder, server: Some(server) }
     }
 
-    /// Ends it and keeps its folder.
+    /// Stops the server and keeps its folder.
     pub fn end(mut self) -> TempDir {
         drop(self.server.take());
         std::mem::replace(&mut self.folder, tempfile::tempdir().unwrap())
@@ -127,7 +127,7 @@ impl Reply {
     }
 }
 
-/// One request on a connection of its own.
+/// Sends one request on a new connection.
 pub fn send(address: SocketAddr, method: &str, path: &str, headers: &[(&str, &str)], body: &[u8]) -> Reply {
     let mut stream = connect(address);
     let mut head =
@@ -140,7 +140,7 @@ pub fn send(address: SocketAddr, method: &str, path: &str, headers: &[(&str, &st
     }
     head += "\r\n";
     stream.write_all(head.as_bytes()).unwrap();
-    // A server that refuses by the head alone may close before it has read all.
+    // A server that refuses a request by its head may close the connection before it has read everything.
     let _ = stream.write_all(body);
     let mut bytes = vec![];
     let _ = stream.read_to_end(&mut bytes);
@@ -156,7 +156,8 @@ pub fn connect(address: SocketAddr) -> TcpStream {
     stream
 }
 
-/// The data of all server-sent events of a job until the server ends the stream; `each` is called with every one as it comes.
+/// The data of all server-sent events of a job until the server ends the stream; `each` is called with every event as it
+/// arrives.
 pub fn events(address: SocketAddr, id: &str, mut each: impl FnMut(&Value)) -> Vec<Value> {
     let mut stream = connect(address);
     let head = format!("GET /v1/jobs/{id}/events HTTP/1.1\r\nConnection: close\r\nHost: {address}\r\n\r\n");
@@ -222,7 +223,7 @@ pub fn frame() -> Form {
         .file("camera", "camera.json", &read("camera.json"))
 }
 
-/// The same with objects to look for by point pair features, the fastest method.
+/// The same with objects to search by point pair features, the fastest method.
 pub fn search(objects: &str) -> Form {
     frame().text("objects", objects).text("method", "ppf")
 }
@@ -248,7 +249,7 @@ fn found_without_a_server() -> Value {
     let query = Query { depth: Some(&prepared), min_confidence, ..Query::new(&camera) };
     let run = sixfold_runner::ImageRun { estimator: &estimator, query };
     let store = ObjectStore::new(folder.path());
-    // Numbers that were written and read again, as those of the server.
+    // Written and read again, as the numbers of the server are.
     let written =
         |report: &_| -> Value { serde_json::from_slice(&serde_json::to_vec(report).unwrap()).unwrap() };
     let mut poses = serde_json::Map::new();

@@ -13,7 +13,7 @@ use crate::support::{Form, Reply, TestServer, events, result, send};
 
 const COUNT: usize = 6;
 
-/// A red block with a narrower blue one on it, beside its middle.
+/// A red block with a narrower blue one on it, off centre.
 fn body() -> Mesh {
     let block = |low: [f64; 3], high: [f64; 3], color: [u8; 3]| {
         let corner = |i: usize| {
@@ -129,7 +129,7 @@ fn an_object_is_taught_corrected_accepted_and_kept() {
     let teaching = server.post("/v1/teachings", &form("body", COUNT)).expect(201).json();
     let path = format!("/v1/teachings/{}", id_of(&teaching));
     let show = || server.get(&path).expect(200).json();
-    // Readers see it while the job has the folder; nobody else changes it then.
+    // Readers can access it while the job has the folder; nothing else changes it then.
     let mut seen = vec![];
     let ended = events(server.address, &job_of(&teaching), |event| {
         assert_eq!(show()["photographs"].as_array().unwrap().len(), COUNT);
@@ -155,7 +155,7 @@ fn an_object_is_taught_corrected_accepted_and_kept() {
     server.get(&format!("{path}/photographs/2/mask.png")).expect(200);
     server.get(&format!("{path}/mesh.ply?faces=500")).expect(200);
     corrected(&server, &path);
-    // The mesh alone is made again: that needs no network.
+    // Only the mesh is made again, which needs no network.
     let job = post(&server, &format!("{path}/run")).expect(202).json();
     let done = server.result(&id_of(&job)).expect(200).json();
     assert_eq!((&done["photographs"], &done["left_out"][0]["photograph"]), (&json!(5), &json!("4.png")));
@@ -165,7 +165,7 @@ fn an_object_is_taught_corrected_accepted_and_kept() {
     server.get("/v1/objects/body/thumbnail.png").expect(200);
     let files = server.get("/v1/objects/body").expect(200).json()["files"].to_string();
     assert!(files.contains("ppf.bin") && files.contains("views"), "{files}");
-    // All is there after a restart; what this teaching stored it may store again, another's object not.
+    // Everything is there after a restart. The teaching may replace the object that it stored itself, but not another one.
     let server = TestServer::within(server.end(), |o| o);
     let after = server.get(&path).expect(200).json();
     assert_eq!((&after["state"], &after["object"]), (&json!("accepted"), &json!("body")));
@@ -179,7 +179,8 @@ fn an_object_is_taught_corrected_accepted_and_kept() {
     server.get("/v1/objects/body").expect(200);
 }
 
-/// Corrects a mask, a pose by matrix and by points, and leaves a photograph out; then takes back what would change all masks.
+/// Corrects a mask, a pose by matrix and by points, and leaves a photograph out; then removes the corrections that would
+/// change all masks.
 fn corrected(server: &TestServer, path: &str) {
     let truth = photographs();
     let photograph = |number: usize, what: &str| format!("{path}/photographs/{number}/{what}");
@@ -260,7 +261,7 @@ fn a_pose_is_given_by_a_matrix_or_by_points() {
 fn depth_images_belong_to_the_photographs_by_their_names() {
     let truth = photographs();
     let server = TestServer::new();
-    // Sent in another order than that of their names.
+    // Sent in a different order from their names.
     let all = (0..3).rev().fold(with_camera(Form::default().text("name", "deep")), |form, i| {
         form.file("photographs", &format!("{i}.png"), &truth.files[i])
     });
@@ -278,7 +279,7 @@ fn depth_images_belong_to_the_photographs_by_their_names() {
     let job = post(&server, &format!("{path}/run")).expect(202).json();
     let done = server.result(&id_of(&job)).expect(200).json();
     assert!(done["with_depth"].as_f64().unwrap() > 0.9, "{done}");
-    // Depth of another photograph would contradict the masks and cut the object away.
+    // Depth of another photograph would contradict the masks and carve the object away.
     let diameter = done["mesh"]["diameter"].as_f64().unwrap();
     assert!((diameter - 0.147).abs() < 0.02, "{done}");
 }
@@ -300,7 +301,7 @@ fn a_teaching_survives_a_kill_and_a_cancelled_one_resumes() {
     assert!(killed);
     let server = TestServer::within(folder, |o| o);
     let path = format!("/v1/teachings/{}", id_of(&teaching));
-    // The job runs again by itself; cancelled, it keeps what is done.
+    // The job runs again automatically; after cancelling, finished steps are kept.
     let mut cancelled = false;
     let ended = events(server.address, &job, |event| {
         if event["progress"]["step"] == "finding the object" && !cancelled {
@@ -362,7 +363,7 @@ fn what_teaches_nothing_is_refused_with_what_to_do() {
     }
 }
 
-/// What a teaching says once its job has failed.
+/// The state of a teaching after its job has failed.
 fn failed(server: &TestServer, form: &Form) -> (String, Value) {
     let teaching = server.post("/v1/teachings", form).expect(201).json();
     let problem = server.result(&job_of(&teaching)).expect(422).json();

@@ -1,14 +1,14 @@
-//! Where photographs show the two ends of a known length.
+//! The two ends of a known length, in photographs.
 
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 use anyhow::{Result, bail};
 
-/// Where a photograph shows two points, pixels; `None` for one that it does not show.
+/// Two points in a photograph, in pixels; `None` for a point that it does not show.
 pub type TwoPixels = [Option<[f64; 2]>; 2];
 
-/// Where a photograph shows two points.
+/// Two points in a photograph.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Ends {
     photograph: String,
@@ -38,7 +38,7 @@ impl FromStr for Ends {
 }
 
 impl Ends {
-    /// The points with the numbers of the files, each of which is named by its path or by its name.
+    /// The points with the index of their file in `files`; a file is given by its path or by its name.
     ///
     /// # Errors
     /// When no file has the name, or several have.

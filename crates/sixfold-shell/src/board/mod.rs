@@ -1,5 +1,5 @@
-//! A camera, and where it was, from photographs of the printed board, as it is listed in files and drawn: what every command on
-//! such photographs does.
+//! Intrinsics and poses of a camera from photographs of the printed board, for all commands on such photographs: computation,
+//! lists in files, and images.
 
 mod ends;
 mod photographs;
@@ -19,10 +19,10 @@ pub use self::ends::{Ends, TwoPixels};
 use self::photographs::leave_out_other_sizes;
 pub use self::photographs::{Photograph, photograph_files, read_photographs};
 
-/// What `--ruler` says, millimetres, in metres.
+/// The value of `--ruler`, millimetres, in metres.
 ///
 /// # Errors
-/// When it is no length that a ruler on a sheet of paper can have.
+/// When a ruler on a sheet of paper cannot have this length.
 pub fn ruler_in_metres(ruler: Option<f64>) -> Result<Option<f64>> {
     let Some(millimetres) = ruler else { return Ok(None) };
     let metres = millimetres / 1000.0;
@@ -35,7 +35,7 @@ pub fn ruler_in_metres(ruler: Option<f64>) -> Result<Option<f64>> {
 /// The camera and all photographs, as `photographs.json` lists them.
 #[derive(Serialize)]
 pub struct Calibrated {
-    /// What the board was printed on.
+    /// The paper that the board was printed on.
     pub paper: Paper,
     /// Side of a tag, metres.
     pub tag_side: f64,
@@ -46,18 +46,18 @@ pub struct Calibrated {
     pub deviations: Option<[f64; 9]>,
     /// Root mean square of all residuals, pixels.
     pub rms_px: f64,
-    /// All photographs, those that are not used too.
+    /// All photographs, including those that are not used.
     pub photographs: Vec<Listed>,
 }
 
 /// A photograph.
 #[derive(Serialize)]
 pub struct Listed {
-    /// Where it was read.
+    /// Path of the file.
     pub file: PathBuf,
-    /// Tags that were found in it.
+    /// Number of tags found in it.
     pub tags: usize,
-    /// Pose of the board, row by row; absent where it is not used, as the others below.
+    /// Pose of the board, row by row. Absent if the photograph is not used, as the fields below.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub camera_from_board: Option<[[f64; 4]; 4]>,
     /// Root mean square of its residuals, pixels.
@@ -76,9 +76,9 @@ pub struct Listed {
 pub struct ListedCorner {
     /// Number of the tag.
     pub tag: usize,
-    /// Where it was found, pixels.
+    /// Its detected position, pixels.
     pub pixel: [f64; 2],
-    /// How far from it the board is seen, pixels.
+    /// Difference to the projected corner of the board, pixels.
     pub residual: [f64; 2],
 }
 
@@ -89,7 +89,7 @@ struct Used {
     rms: f64,
 }
 
-/// What all photographs say together.
+/// The joint solution of all photographs.
 struct Solved {
     camera: Camera,
     deviations: Option<[f64; 9]>,
@@ -98,11 +98,11 @@ struct Solved {
 }
 
 impl Calibrated {
-    /// What photographs show: poses by a camera that is known, or, without one, camera and poses. `ruler` is the length of the
-    /// board's ruler in metres where that is not what it should be. Photographs of another size than most are left out.
+    /// Computes the poses with a known camera or, without one, the camera and the poses. `ruler` is the measured length of the
+    /// board's ruler in metres, if it differs from the nominal length. Photographs of another size than most are left out.
     ///
     /// # Errors
-    /// When no photograph shows a board, too few show enough of it, or the known camera is of other images.
+    /// When no photograph shows a board, too few show enough of it, or the known camera does not fit the images.
     pub fn of(
         photographs: &mut [Photograph],
         ruler: Option<f64>,
@@ -137,9 +137,9 @@ impl Calibrated {
 
 /// A calibration with the poses as poses.
 pub struct Calibration {
-    /// All that is listed.
+    /// The camera and all photographs.
     pub calibrated: Calibrated,
-    /// `camera_from_board` of each photograph, also of those that are left out for their size.
+    /// `camera_from_board` of each photograph, including those that are left out because of their size.
     pub poses: Vec<Option<Pose>>,
 }
 
@@ -154,13 +154,13 @@ impl Calibration {
         pictures::photographs(photographs, &self.calibrated, &self.poses)
     }
 
-    /// The residuals of all corners where they are in the photographs, enlarged; a colour for each photograph.
+    /// The enlarged residuals of all corners at their positions in the photographs, one colour per photograph.
     pub fn residuals(&self) -> RgbImage {
         pictures::residuals(&self.calibrated)
     }
 }
 
-/// Poses by a camera that is known.
+/// The poses with a known camera.
 fn with_camera(file: &CameraFile, size: (usize, usize), corners: &[Vec<Corner>]) -> Result<Solved> {
     let mut camera = file.camera;
     if file.sized {
@@ -186,7 +186,7 @@ fn with_camera(file: &CameraFile, size: (usize, usize), corners: &[Vec<Corner>])
     Ok(Solved { camera, deviations: None, rms, views })
 }
 
-/// Camera and poses.
+/// The camera and the poses.
 fn without_camera(
     options: &CalibrationOptions,
     size: (usize, usize),
@@ -201,7 +201,7 @@ fn without_camera(
     Ok(Solved { camera: found.camera, deviations: Some(found.deviations), rms: found.rms, views })
 }
 
-/// What is written, and the pose of each photograph.
+/// The list to be written, and the pose of each photograph.
 fn listed(
     board: &Board,
     solved: Solved,
@@ -237,7 +237,7 @@ fn listed(
     (calibrated, poses)
 }
 
-/// Why photographs cannot be used, for an error that ends everything.
+/// The reasons why photographs cannot be used, for an error that ends the command.
 fn reasons_of(
     photographs: &[Photograph],
     corners: &[Vec<Corner>],

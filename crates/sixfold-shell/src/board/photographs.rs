@@ -12,22 +12,22 @@ use sixfold_io::read_rgb;
 /// Width of a photograph in the overview, pixels.
 pub(super) const THUMBNAIL: usize = 480;
 
-/// A photograph, and what it shows of the board.
+/// A photograph and the tags of the board in it.
 pub struct Photograph {
-    /// Where it was read.
+    /// Path of the file.
     pub file: PathBuf,
     /// Width and height, pixels; zero where it cannot be read.
     pub size: (usize, usize),
     /// The tags in it.
     pub tags: Vec<Tag>,
     pub(super) thumbnail: RgbImage,
-    /// Why it is not used, as far as it alone says.
+    /// Why it is not used, if that follows from this photograph alone.
     pub left_out: Option<String>,
     /// Whether it cannot be read.
     pub unreadable: bool,
 }
 
-/// The photographs among these files and in these folders, in the order of their names within a folder.
+/// The photographs among these files and in these folders; within a folder, sorted by name.
 ///
 /// # Errors
 /// For a folder that cannot be read, or has none.
@@ -58,13 +58,14 @@ pub fn photograph_files(given: &[PathBuf]) -> Result<Vec<PathBuf>> {
     Ok(files)
 }
 
-/// HEIF files too: they are refused by name, with what to do, and not passed over.
+/// Whether a file is a photograph. HEIF files count: they are refused by name with advice, not skipped.
 fn is_photograph(file: &Path) -> bool {
     let extension = file.extension().and_then(|e| e.to_str()).map(str::to_ascii_lowercase);
     extension.is_some_and(|e| ["png", "jpg", "jpeg", "heic", "heif"].contains(&e.as_str()))
 }
 
-/// Reads photographs and finds their tags. One that cannot be read says so and stops nothing.
+/// Reads photographs and finds their tags. A photograph that cannot be read is marked and does not stop the
+/// others.
 ///
 /// # Errors
 /// When the user interrupts.
@@ -101,7 +102,7 @@ fn photograph(file: &Path) -> Photograph {
     }
 }
 
-/// The size of most photographs; those of another are left out.
+/// The most common size of the photographs; photographs of other sizes are left out.
 ///
 /// # Errors
 /// When none shows a tag.
@@ -122,7 +123,7 @@ pub(crate) fn leave_out_other_sizes(photographs: &mut [Photograph]) -> Result<(u
     Ok((width, height))
 }
 
-/// The mean of the pixels that fall together.
+/// A smaller image: each pixel is the mean of the pixels that it replaces.
 fn reduced(image: &RgbImage) -> RgbImage {
     let (width, height) = image.size();
     let factor = (width as f64 / THUMBNAIL as f64).max(1.0);

@@ -1,4 +1,4 @@
-//! A calibration as images: the photographs with what was found in them, and the residuals.
+//! Images of a calibration: the photographs with the tags found in them, and the residuals.
 
 use crate::overlay::{label, line};
 use sixfold_geometry::{Camera, Image, Pose, RgbImage, Vec3};
@@ -11,9 +11,9 @@ const GOOD: [u8; 3] = [60, 220, 90];
 const BAD: [u8; 3] = [255, 90, 60];
 /// Length of the axes, metres.
 const AXIS: f64 = 0.06;
-/// Width of the picture of residuals, pixels.
+/// Width of the image of residuals, pixels.
 const WIDTH: f64 = 960.0;
-/// Residuals are this many times as long as they are, in pixels of the photograph.
+/// Factor by which residuals are enlarged, in pixels of the photograph.
 const ENLARGED: f64 = 100.0;
 
 /// All photographs with the tags in them and the board's axes: x red, y green, z blue.
@@ -60,7 +60,7 @@ fn axes(image: &mut RgbImage, camera: &Camera, camera_from_board: &Pose, scale: 
     for (axis, color) in [(Vec3::x(), [255, 60, 60]), (Vec3::y(), [60, 255, 60]), (Vec3::z(), [80, 130, 255])]
     {
         if let Some(end) = seen(&(axis * AXIS)) {
-            // Three lines beside each other: one would be lost among the tags.
+            // Three lines side by side: a single one would be hard to see among the tags.
             for d in [-1.0, 0.0, 1.0] {
                 line(image, [origin.x + d, origin.y], [end.x + d, end.y], color);
                 line(image, [origin.x, origin.y + d], [end.x, end.y + d], color);
@@ -69,7 +69,7 @@ fn axes(image: &mut RgbImage, camera: &Camera, camera_from_board: &Pose, scale: 
     }
 }
 
-/// The residuals of all corners where they are in the photographs, enlarged; a colour for each photograph.
+/// The enlarged residuals of all corners at their positions in the photographs, one colour per photograph.
 pub(super) fn residuals(found: &Calibrated) -> RgbImage {
     let scale = WIDTH / found.camera.width as f64;
     let (top, height) = (28.0, found.camera.height as f64 * scale);

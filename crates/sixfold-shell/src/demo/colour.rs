@@ -11,13 +11,13 @@ use super::SamplePose;
 pub struct Colour {
     /// Weights of Pix2Pose.
     pub weights: Option<PathBuf>,
-    /// Weights of the detector; without them boxes are the ground truth's.
+    /// Weights of the detector; without them the boxes come from the ground truth.
     pub detector: Option<PathBuf>,
-    /// What was found.
+    /// The poses found.
     pub poses: Vec<SamplePose>,
     /// How many of the poses are within 10 % of the diameter.
     pub correct: usize,
-    /// Targets in colour images that were looked for.
+    /// Targets that were searched for in colour images.
     pub targets: usize,
     /// Images that were written.
     pub pictures: Vec<PathBuf>,

@@ -1,4 +1,5 @@
-//! Poses from colour in the samples. A detector says where the objects are; without its weights the ground truth does.
+//! Poses from colour in the samples. The regions of the objects come from a detector or, without its weights, from the
+//! ground truth.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -32,7 +33,7 @@ pub(super) fn run(
         Ok(weights) => weights,
         Err(error) => return Ok(Colour::none(None, error.to_string())),
     };
-    // What was asked for has to be right.
+    // Weights that the user named must be valid.
     let detector = match files.detector.map(Path::to_owned).or_else(|| DETECTOR.find().ok()) {
         None => None,
         Some(file) => match TrainedDetector::load(&file) {
@@ -51,7 +52,7 @@ pub(super) fn run(
     }
 }
 
-/// The targets' objects as the model knows them; an error unless it was trained on their meshes.
+/// The targets' objects in the model; an error unless it was trained on their meshes.
 fn objects(
     pix2pose: &Pix2PoseEstimator,
     targets: &[Target],

@@ -1,5 +1,5 @@
-//! What `sixfold demo` runs: the whole way on the sample frames, from files to scored poses and images. Here poses from depth;
-//! `colour_poses.rs` adds poses from colour, `samples.rs` is what both know of the samples.
+//! The run of `sixfold demo`: all steps on the sample frames, from files to scored poses and images. This file finds poses
+//! from depth; `colour_poses.rs` adds poses from colour, and `samples.rs` holds the objects that both use.
 
 mod colour;
 #[cfg(feature = "networks")]
@@ -35,7 +35,7 @@ const SIMULATED: u32 = 1000;
 /// Poses within this fraction of the diameter are right.
 const RIGHT: f64 = 0.1;
 
-/// What the demo runs with; what is not named is found among the files that come with Sixfold.
+/// Input files of the demo; files that are not given are found among those that come with Sixfold.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct DemoFiles<'a> {
     /// Folder of the sample data.
@@ -46,27 +46,27 @@ pub struct DemoFiles<'a> {
     pub detector: Option<&'a Path>,
 }
 
-/// A pose, beside the ground truth.
+/// A pose with its error against the ground truth.
 #[derive(Serialize)]
 pub struct SamplePose {
     /// Scene and image.
     pub image: String,
-    /// Whether the depth that it was found from is real or simulated; none for a pose from colour.
+    /// Whether the pose was found from real or from simulated depth; absent for a pose from colour.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub depth: Option<&'static str>,
     /// Object id.
     pub object: u32,
-    /// Mean distance of the model's points (nearest points for symmetric objects), millimetres.
+    /// Mean distance of the model's points at the two poses (nearest points for symmetric objects), millimetres.
     pub add_s_mm: f64,
     /// The same as a fraction of the diameter.
     pub add_s_of_diameter: f64,
     /// The method's confidence.
     pub confidence: f64,
-    /// Time it took.
+    /// Time of the search, seconds.
     pub seconds: f64,
 }
 
-/// What the demo found.
+/// The results of the demo.
 #[derive(Serialize)]
 pub struct Demo {
     /// Poses from depth.
@@ -75,7 +75,7 @@ pub struct Demo {
     pub correct: usize,
     /// Poses to be found.
     pub targets: usize,
-    /// Time of everything.
+    /// Total time, seconds.
     pub seconds: f64,
     /// Images that were written.
     pub pictures: Vec<PathBuf>,
@@ -86,10 +86,10 @@ pub struct Demo {
 }
 
 impl Demo {
-    /// Finds poses in the sample frames and scores them; what is derived from the objects is kept in the folder `objects`.
+    /// Finds poses in the sample frames and scores them; data derived from the objects is kept in the folder `objects`.
     ///
     /// # Errors
-    /// When the sample data cannot be found or read, or named weights are no such weights.
+    /// When the sample data cannot be found or read, or given weights are not of the right kind.
     pub fn run(files: &DemoFiles<'_>, objects: &Path, out: &mut Pictures) -> Result<Demo> {
         let start = Instant::now();
         let folder = files.data.map_or_else(|| DEMO.find(), |data| Ok(data.to_owned()))?;
@@ -129,7 +129,7 @@ impl Demo {
     }
 }
 
-/// The samples' objects, each described when it is first looked for.
+/// The samples' objects; the features of each are computed when it is first needed.
 struct Samples<'a> {
     dataset: &'a BopDataset,
     infos: sixfold_mesh::ModelsInfo,
@@ -151,7 +151,7 @@ impl<'a> Samples<'a> {
     }
 }
 
-/// Poses from depth: as they are shown, and as they are scored.
+/// Poses from depth, in the forms for display and for scoring.
 #[derive(Default)]
 struct FromDepth {
     poses: Vec<SamplePose>,

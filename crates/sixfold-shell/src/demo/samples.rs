@@ -1,4 +1,4 @@
-//! The samples: what is known of their objects.
+//! The objects of the samples.
 
 use std::path::Path;
 
@@ -10,7 +10,7 @@ use sixfold_mesh::{Mesh, ModelInfo, ModelsInfo};
 use sixfold_estimator::{Object, PoseEstimator, downcast};
 use sixfold_ppf::{ObjectModel, PpfEstimator, PpfObject};
 
-/// An object of the samples, described for point pair features.
+/// An object of the samples, prepared for point pair features.
 pub(super) struct Known {
     pub object: Object,
     pub info: ModelInfo,
@@ -19,7 +19,7 @@ pub(super) struct Known {
 }
 
 impl Known {
-    /// Object `id`; its description is kept in `folder`.
+    /// Object `id`; its prepared data is kept in `folder`.
     pub(super) fn new(dataset: &BopDataset, infos: &ModelsInfo, id: u32, folder: &Path) -> Result<Known> {
         let mesh = dataset.model(id, Models::Rendering)?;
         let points = ModelPoints::new(mesh.vertices())

@@ -1,4 +1,4 @@
-//! In the place of `colour_poses.rs` when the feature `networks` is off.
+//! Replaces `colour_poses.rs` when the feature `networks` is off.
 
 use std::collections::BTreeMap;
 
@@ -11,7 +11,7 @@ use super::colour::Colour;
 use super::samples::Known;
 use crate::WITHOUT_NETWORKS;
 
-/// No poses, and why; an error where weights were given.
+/// No poses and the reason; an error if weights were given.
 pub(super) fn run(
     files: &DemoFiles<'_>,
     _out: &mut Pictures,

@@ -1,4 +1,4 @@
-//! The network and the store that grasps from experience need.
+//! The network and the store for grasps from experience.
 
 use std::path::{Path, PathBuf};
 
@@ -43,7 +43,7 @@ pub fn model(a: &NetworkArguments) -> Result<DgcmModel> {
     DgcmModel::load(weights).context("--weights")
 }
 
-/// Parses a store's place on the command line.
+/// Parses the location of a store on the command line.
 pub fn store_place() -> impl TypedValueParser<Value = StorePlace> {
     OsStringValueParser::new().try_map(|text| match text.is_empty() {
         true => Err("found nothing, expected a file or the address of a server"),
@@ -51,7 +51,7 @@ pub fn store_place() -> impl TypedValueParser<Value = StorePlace> {
     })
 }
 
-/// The experiences of a store that is there, for a network.
+/// The experiences of an existing store, for a network.
 pub fn memory(place: &StorePlace, model: &DgcmModel) -> Result<Memory> {
     let mut memory = Memory::new(place.open()?, model)?;
     note_left_out(&memory.take_left_out(), &place.to_string());
@@ -64,7 +64,7 @@ pub fn memory(place: &StorePlace, model: &DgcmModel) -> Result<Memory> {
     Ok(memory)
 }
 
-/// Names what could not be read and was left out, and how it is removed.
+/// Reports the rows that could not be read and were left out, and how to remove them.
 pub fn note_left_out(errors: &[StoreError], place: &str) {
     for error in errors {
         match error {
@@ -83,8 +83,8 @@ pub fn note_left_out(errors: &[StoreError], place: &str) {
     }
 }
 
-/// The file in which a store that can be written is on this machine: its own, or that of the robot's copy, which is in `out`
-/// where nothing else is said.
+/// The local file of a writable store: the store itself, or the robot's copy of a store on a server, which is in `out` by
+/// default.
 pub(crate) fn local_file(place: &StorePlace, outbox: &OutboxArguments, out: &Path) -> Result<PathBuf> {
     match (&outbox.outbox, place) {
         (Some(file), StorePlace::File(_)) => bail!(
@@ -97,7 +97,8 @@ pub(crate) fn local_file(place: &StorePlace, outbox: &OutboxArguments, out: &Pat
     }
 }
 
-/// A store, made where there is none. When it lies on a server, `file` is between, so that the server may go away.
+/// Opens a store, or creates it. For a store on a server, `file` is the local copy, so that work continues while the server
+/// is unreachable.
 pub(crate) fn writable_store(place: &StorePlace, file: &Path) -> Result<Box<dyn ExperienceStore + Send>> {
     Ok(place.create_with_outbox(file, |notice| eprintln!("note: {notice}"))?)
 }

@@ -1,4 +1,4 @@
-//! The gripper that a command is given.
+//! The gripper of a command.
 
 use std::path::Path;
 

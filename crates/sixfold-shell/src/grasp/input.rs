@@ -27,24 +27,25 @@ pub struct InputArguments {
     pub mask: Option<PathBuf>,
 }
 
-/// What was read, without distortion.
+/// The input of a grasp command, without lens distortion.
 pub struct Input {
-    /// Metres.
+    /// Depth image, metres.
     pub depth: DepthImage,
-    /// Of all images.
+    /// The camera of all images.
     pub camera: Camera,
-    /// Where there is one.
+    /// The colour image, if given.
     pub rgb: Option<RgbImage>,
-    /// The object; `None` when nothing stands on the table.
+    /// The view of the object; `None` when nothing is on the table.
     pub view: Option<GraspView>,
-    /// When the files were read, and work began.
+    /// Time at which the files were read and computation began.
     pub began: std::time::Instant,
 }
 
-/// Reads and prepares the view of the masked object, or of the largest thing on the table; `rgb`: a colour image for overlays.
+/// Reads and prepares the view of the masked object, or of the largest object on the table; `rgb`: a colour image for
+/// overlays.
 ///
 /// # Errors
-/// For files that cannot be read or do not go together.
+/// For files that cannot be read or do not belong together.
 pub fn read(a: &InputArguments, rgb: Option<&Path>, seed: u64) -> Result<Input> {
     let file = CameraFile::read(&a.camera)?;
     let scale = a.depth_scale.or(file.depth_scale).ok_or_else(|| {

@@ -1,9 +1,9 @@
-//! Rows of a long measurement, each on the disk as soon as it is known, so that a stopped one resumes. One process at a time
-//! writes a journal.
+//! Rows of a long measurement, each written to disk as soon as it is known, so that an interrupted measurement can be resumed.
+//! One process at a time writes a journal.
 //!
-//! A journal of what goes into a store of experiences has a name, under which the store keeps the same rows, each in the same
-//! step as what it is about. What the file lacks after an interruption is taken from there; a store that lacks rows of the file
-//! is another one, and refused.
+//! A journal of data that goes into a store of experiences has a name. Under this name the store keeps the same rows, each
+//! written in the same transaction as its data. Rows that the file lacks after an interruption are taken from the store. A
+//! store that lacks rows of the file is a different store and is refused.
 
 use std::fs::{File, OpenOptions};
 use std::hash::{BuildHasher, Hasher, RandomState};
@@ -34,7 +34,7 @@ impl Journal {
         Self::open_groups(path, options, 1)
     }
 
-    /// As [`Journal::open`], where each `group` rows belong together: what is there of the last group, if not all, is dropped.
+    /// As [`Journal::open`], for rows that belong together in groups of `group`: an incomplete last group is dropped.
     ///
     /// # Errors
     /// As [`Journal::open`].
@@ -53,7 +53,7 @@ impl Journal {
         Ok((journal, rows))
     }
 
-    /// `header` makes the first line, or tests the one that is there; rows come in groups of `group`.
+    /// `header` makes the first line, or checks an existing one; rows come in groups of `group`.
     fn with_header(
         path: &Path,
         group: usize,
@@ -69,7 +69,7 @@ impl Journal {
             Err(e) if e.kind() == std::io::ErrorKind::NotFound => String::new(),
             Err(e) => return Err(e).with_context(|| name.to_string()),
         };
-        // A line without an end was being written when the program was stopped.
+        // A line without a line end was being written when the program was stopped.
         let whole = text.rfind('\n').map_or("", |end| &text[..=end]);
         let mut lines = whole.split_inclusive('\n');
         let first = lines.next();
@@ -115,7 +115,7 @@ impl Journal {
 
     /// Writes a row that is text already.
     pub fn line(&mut self, line: &str) -> Result<()> {
-        // One write, so that little else than a whole line, or a whole group, is ever there.
+        // A single write, so that the file almost always ends with a whole line or group.
         self.file
             .write_all(format!("{line}\n").as_bytes())
             .and_then(|()| self.file.flush())
@@ -170,10 +170,10 @@ impl StoreJournal {
         )
     }
 
-    /// Takes over the rows that only the store has; all rows.
+    /// Takes over the rows that only the store has; returns all rows.
     ///
     /// # Errors
-    /// When the store has not all rows of the file.
+    /// When the store lacks rows of the file.
     pub fn complete<T: DeserializeOwned>(
         &mut self,
         store: &dyn ExperienceStore,
@@ -197,7 +197,7 @@ impl StoreJournal {
     }
 }
 
-/// What the first line of a store's journal begins with; its name and the options follow.
+/// The beginning of the first line of a store's journal; its name and the options follow.
 const HEADER: &str = "{\"journal\":\"";
 
 /// 128 random bits: the standard library seeds its hash tables from the system.
@@ -234,7 +234,7 @@ mod tests {
         drop(journal);
         let whole = std::fs::read_to_string(&file).unwrap();
         assert_eq!(whole, "\"options\"\n1\n2\n3\n");
-        // Cut off within the next group, within a row or between two.
+        // Interrupted in the next group, within a row or between two rows.
         for more in ["4", "4\n", "4\n5\n", "4\n5\n6"] {
             std::fs::write(&file, format!("{whole}{more}")).unwrap();
             let (mut journal, rows) = open();

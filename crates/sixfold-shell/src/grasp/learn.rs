@@ -1,5 +1,5 @@
-//! `sixfold grasp learn`: the incremental loop of section 6.2.1 with a simulated hand. Propose from experience when some is
-//! near enough, else by geometry; execute; store what worked; go on.
+//! `sixfold grasp learn`: the incremental loop of section 6.2.1 with a simulated hand. Propose a grasp from experience if one is
+//! near enough, else by geometry; execute it; store it if it worked; continue.
 
 use std::path::PathBuf;
 
@@ -80,22 +80,22 @@ pub struct LearnArguments {
     pub json: JsonArguments,
 }
 
-/// What is learned on.
+/// An object of the learning run.
 pub struct TestObject {
-    /// Class, as the provenance says it.
+    /// Class, as in the provenance.
     pub class: String,
-    /// Name, as rows and the store have it.
+    /// Name, as in the rows and the store.
     pub name: String,
-    /// Metres, as it lies.
+    /// Mesh in metres, in its resting orientation.
     pub mesh: Mesh,
-    /// A synthetic object, which knows its parts, and how it lies.
+    /// The synthetic object, with its named parts, and its resting orientation.
     pub made: Option<(Member, Rest)>,
 }
 
 impl TestObject {
-    /// The part that a grasp is on: that of the surface nearest to the centre between the pads, a centimetre behind the
-    /// tips, if most of what was seen between the pads belongs to it too; `None` for no part in particular. A hand over the body of a
-    /// drill whose tips reach the handle is not on the handle.
+    /// The part that a grasp is on: the part at the surface point nearest to the centre between the pads (a centimetre behind the
+    /// tips), if most of the seen points between the pads belong to it too; otherwise `None`. For example, a hand over the body of
+    /// a drill is not on the handle even if its tips reach it.
     fn part(
         &self,
         camera_from_object: &Pose,
@@ -165,9 +165,9 @@ struct Row {
     nearest: Option<f64>,
     ending: String,
     held: bool,
-    /// Which of the proposals it was, from 0.
+    /// Its rank among the proposals, from 0.
     rank: usize,
-    /// Number of the experience that came of it.
+    /// Id of the experience stored from it.
     stored: Option<i64>,
 }
 
@@ -186,28 +186,28 @@ struct Recorded<'a> {
     gripper: &'a Gripper,
 }
 
-/// What was learned.
+/// Summary of the learning run.
 #[derive(Serialize)]
 pub struct Whole {
     /// Scenes.
     pub attempts: usize,
-    /// Those in which a grasp held.
+    /// Scenes in which a grasp held.
     pub held: usize,
-    /// Their fraction.
+    /// Success rate.
     pub rate: f64,
-    /// Wilson, 95 %.
+    /// Wilson interval of the rate, 95 %.
     pub interval: (f64, f64),
-    /// Scenes in which experience proposed.
+    /// Scenes in which experience proposed the grasp.
     pub from_experience: usize,
-    /// In the store.
+    /// Experiences in the store.
     pub experiences: usize,
     /// Grasps whose outcome is known for this gripper.
     pub outcomes: usize,
-    /// The objects, one after another.
+    /// The objects, in order.
     pub objects: Vec<Curve>,
 }
 
-/// How it went with one object, attempt by attempt.
+/// The results of one object, attempt by attempt.
 #[derive(Serialize)]
 pub struct Curve {
     /// Its name.
@@ -303,7 +303,7 @@ fn learn_with(a: &LearnArguments, wrap: impl FnOnce(BoxedStore) -> BoxedStore) -
 
 type BoxedStore = Box<dyn ExperienceStore + Send>;
 
-/// A row as store and journal keep it.
+/// A row as text, as store and journal keep it.
 fn line(row: &Row) -> String {
     serde_json::to_string(row).unwrap_or_default()
 }
@@ -331,7 +331,7 @@ fn whole(pupils: &[TestObject], rows: &[Row], memory: &mut Memory, gripper: &str
     }
 }
 
-/// One letter an attempt: G geometry, E experience; capitals held.
+/// One letter per attempt: G for geometry, E for experience; a capital means that the grasp held.
 pub fn marks(curve: &Curve) -> String {
     let letter = |(held, e): (&bool, &bool)| match (held, e) {
         (true, true) => 'E',
@@ -342,7 +342,7 @@ pub fn marks(curve: &Curve) -> String {
     curve.held.iter().zip(&curve.from_experience).map(letter).collect()
 }
 
-/// One scene with an object, and what was learned of it, which the store keeps with a row of the journal.
+/// One attempt on an object. The store keeps the result together with a row of the journal.
 fn attempt(
     a: &LearnArguments,
     setting: &Hardness,
@@ -457,7 +457,7 @@ mod tests {
             let grasp = Grasp { camera_from_gripper: pose, opening: 0.08, width: 0.03, quality };
             pupil.part(&Pose::identity(), &grasp, &view, &gripper)
         };
-        // From behind across the handle, the tips a centimetre past its middle.
+        // From behind across the handle, the tips a centimetre past its centre.
         assert_eq!(part(middle + Vec3::x() * 0.01, Vec3::x()), Some("handle"));
         // From above, the tips at the upper end of the handle, the body between the fingers.
         let above = Vec3::new(middle.x, middle.y, top - 0.025);
@@ -530,7 +530,7 @@ mod tests {
     /// The journal's lines, the attempts, and the experiences with their features.
     type LeftBehind = (Vec<String>, Vec<Attempt>, Vec<(Summary, Vec<f32>)>);
 
-    /// All that a run leaves behind, but for times and the journal's name.
+    /// All results of a run, except times and the journal's name.
     fn left_behind(folder: &Path) -> LeftBehind {
         let text = std::fs::read_to_string(folder.join("attempts.jsonl")).unwrap();
         let store = StorePlace::File(folder.join("e.db")).open().unwrap();

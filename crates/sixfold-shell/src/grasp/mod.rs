@@ -1,5 +1,5 @@
-//! What commands on grasps share: the gripper, simulated trials, the objects they are made with, experience, learning by
-//! doing.
+//! The parts that grasp commands share: the gripper, simulated trials, their objects, experience, and learning from
+//! attempts.
 
 #[cfg(feature = "experience")]
 pub mod experience;

@@ -1,4 +1,4 @@
-//! The objects that simulated trials are made with: meshes by name, or a list in a file.
+//! The objects of simulated trials: meshes by name, or a list in a file.
 
 use std::path::{Path, PathBuf};
 
@@ -40,7 +40,7 @@ struct Synthetic {
     number: u64,
 }
 
-/// Seed of the synthetic objects of lists: none of them is one that `learn` or a training makes.
+/// Seed of the synthetic objects of lists, different from the seeds of `learn` and of trainings.
 const LISTED_SEED: u64 = 0x6c69_7374;
 
 impl Listed {
@@ -61,7 +61,7 @@ impl Listed {
     }
 }
 
-/// A named part of an object: what lies within a box of its frame, metres.
+/// A named part of an object: everything inside a box in the object's frame, metres.
 #[derive(Debug, Clone, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PartBox {
@@ -72,7 +72,7 @@ pub struct PartBox {
 }
 
 impl PartBox {
-    /// Whether a point lies inside, or at most `margin` metres off each side.
+    /// Whether a point is inside the box enlarged by `margin` metres on each side.
     pub fn contains(&self, p: &Vec3, margin: f64) -> bool {
         (0..3).all(|k| p[k] >= self.low[k] - margin && p[k] <= self.high[k] + margin)
     }
@@ -88,7 +88,7 @@ enum Up {
 }
 
 impl Up {
-    /// Turns the axis to z.
+    /// The rotation that takes the axis to z.
     fn turn(&self) -> Pose {
         let quarter = std::f64::consts::FRAC_PI_2;
         match self {
@@ -128,7 +128,7 @@ pub fn named_objects(a: &ObjectsArguments) -> Result<Vec<(String, String, Mesh)>
 /// Classes, names and meshes of objects.
 pub type Named = Vec<(String, String, Mesh)>;
 
-/// Class, name and mesh of every object, and its named part where the list tells one.
+/// Class, name and mesh of every object, and its named part where the list states one.
 pub fn objects_with_parts(a: &ObjectsArguments) -> Result<(Named, Vec<Option<PartBox>>)> {
     let Some(list) = a.list.as_deref() else {
         if a.objects.is_empty() {

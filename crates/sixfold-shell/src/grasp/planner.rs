@@ -1,4 +1,4 @@
-//! Who proposes grasps from geometry: the antipodal planner, or one that learned.
+//! The planner that proposes grasps from geometry: the antipodal planner or a trained one.
 
 use std::path::PathBuf;
 
@@ -32,9 +32,9 @@ pub struct PlannerArguments {
     pub planner_weights: Option<PathBuf>,
 }
 
-/// A planner, ready.
+/// A planner that is ready for use.
 pub enum Planner {
-    /// Geometry alone.
+    /// The antipodal planner.
     Antipodal,
     /// GPD.
     #[cfg(feature = "networks")]
@@ -44,7 +44,7 @@ pub enum Planner {
 }
 
 impl Planner {
-    /// As the command line says.
+    /// The planner that the command line selects.
     ///
     /// # Errors
     /// When the file holds no such planner.
@@ -60,7 +60,7 @@ impl Planner {
         }
     }
 
-    /// GPD, of a file or as it comes with Sixfold.
+    /// GPD, from a file or as it comes with Sixfold.
     ///
     /// # Errors
     /// When the file holds no such planner.
@@ -73,7 +73,7 @@ impl Planner {
         Ok(Planner::Gpd(Box::new(model)))
     }
 
-    /// HAF, of a file or as it comes with Sixfold.
+    /// HAF, from a file or as it comes with Sixfold.
     ///
     /// # Errors
     /// When the file holds no such planner.
@@ -91,7 +91,7 @@ impl Planner {
         }
     }
 
-    /// What its results depend on beside the options: a hash of what it learned, empty for geometry.
+    /// A hash of its trained parameters, on which its results depend besides the options; empty for the antipodal planner.
     pub fn fingerprint(&self) -> String {
         let hash =
             |value: &serde_json::Value| format!("{:016x}", sixfold_io::fnv1a(value.to_string().as_bytes()));
@@ -103,8 +103,8 @@ impl Planner {
         }
     }
 
-    /// Grasps on the object of a view with their scores, 0 to 1. `options` are the antipodal planner's; the others take the seed
-    /// alone.
+    /// Grasps on the object of a view with their scores, 0 to 1. `options` are those of the antipodal planner; the others use
+    /// only the seed.
     ///
     /// # Errors
     /// For options out of range.
@@ -133,7 +133,7 @@ impl Planner {
     }
 
     /// Its grasps without experience, in the order in which they would be tried: clusters by their summed scores, HAF's grasps by
-    /// their own (dissertation, section 6.3.2).
+    /// their own scores (dissertation, section 6.3.2).
     pub fn ranked(&self, grasps: &[ScoredGrasp]) -> Vec<GraspCluster> {
         match self {
             Planner::Haf(_) => best_of_clusters(grasps, &ClusterOptions::default()),

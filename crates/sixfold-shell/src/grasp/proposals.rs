@@ -1,4 +1,4 @@
-//! Proposed grasps as a command reports them: numbers for JSON and tables, and an image.
+//! Output of proposed grasps: numbers for JSON and tables, and an image.
 
 use anyhow::Result;
 use serde::Serialize;
@@ -31,19 +31,19 @@ impl From<Plane> for Table {
 /// A grasp.
 #[derive(Serialize)]
 pub struct Proposed {
-    /// The gripper when it closes.
+    /// Pose of the gripper when it closes, 4x4, row by row.
     pub camera_from_gripper: [[f64; 4]; 4],
     /// Distance of the pads before closing, metres.
     pub opening: f64,
     /// Distance of the contacts, metres.
     pub width: f64,
-    /// Of its contacts, or the success probability that a planner learned to predict, 0 to 1.
+    /// Quality of its contacts, or the success probability that a trained planner predicts, 0 to 1.
     pub quality: f64,
-    /// What the quality of its contacts consists of.
+    /// The terms of the quality of its contacts.
     #[serde(skip_serializing_if = "Option::is_none")]
     parts: Option<AntipodalQuality>,
     cluster_score: f64,
-    /// Grasps that it stands for.
+    /// Number of grasps in its cluster.
     pub cluster_members: usize,
     /// The experience it was transferred from, or that agrees with it.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -55,11 +55,11 @@ pub struct Proposed {
 #[derive(Serialize)]
 struct FromExperience {
     kind: &'static str,
-    /// Number of the experience in its store.
+    /// Id of the experience in its store.
     id: Option<i64>,
     /// Distance of the features.
     distance: Option<f64>,
-    /// Whether a difference in size was taken for a scale or for a rotation.
+    /// Whether a difference in size was explained by a scale or by a rotation.
     hypothesis: Option<&'static str>,
     /// The fraction of experience that agrees with the grasp.
     share: f64,
@@ -92,8 +92,8 @@ pub fn of_planner(planner: &Planner, grasps: &[ScoredGrasp]) -> Vec<Proposed> {
     clusters.iter().map(proposed).collect()
 }
 
-/// Grasps of experience and of geometry, the best first. The quality of grasps of a planner that learned is its score, brought to
-/// 0 to 1 over all of them.
+/// Grasps of experience and of geometry, the best first. The quality of grasps of a trained planner is its score, scaled to 0..1
+/// over all its grasps.
 #[cfg(feature = "experience")]
 pub fn of_both(planner: &Planner, grasps: &sixfold_dgcm::transfer::RankedGrasps) -> Vec<Proposed> {
     use sixfold_dgcm::transfer::Kind;
@@ -141,7 +141,7 @@ pub fn picture(
         })
         .collect();
     let mut out = draw_grasps(&background, Some(depth), camera, gripper, &drawn)?;
-    // Number and quality at each, where the hand begins.
+    // Number and quality of each grasp, drawn where the hand begins.
     let label = |(i, p): (usize, &Proposed)| {
         let at = camera.project(&p.pose.translation())?;
         Some(Label {

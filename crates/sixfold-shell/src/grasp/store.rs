@@ -1,5 +1,5 @@
-//! Stores of experiences looked after: experiences and attempts removed, taken over by another store, encoded again, written as
-//! files. A row that cannot be read is named and left out, and the others are not held up.
+//! Maintenance of stores of experiences: remove experiences and attempts, merge stores, encode again, export to files. A row
+//! that cannot be read is reported and left out; the others are still processed.
 
 use std::path::{Path, PathBuf};
 
@@ -12,12 +12,12 @@ use crate::Outcome;
 use crate::folder::OutputFolder;
 use crate::progress::{Progress, check_interrupt};
 
-/// What was stored.
+/// Result of storing an experience.
 #[derive(Serialize)]
 pub struct Added {
-    /// Number of the experience.
+    /// Id of the experience.
     pub id: i64,
-    /// False when it was there already.
+    /// False if the experience was there already.
     pub new: bool,
     /// Pixels of its region of interest.
     pub region_pixels: usize,
@@ -39,17 +39,17 @@ pub fn add(place: &StorePlace, experience: &Experience, grasp: &Path) -> Result<
     Ok(Added { id, new, region_pixels })
 }
 
-/// What was removed.
+/// Result of removing experiences and attempts.
 #[derive(Default, Serialize)]
 pub struct Forgotten {
     /// Experiences.
     pub forgotten: Vec<i64>,
-    /// Numbers of none.
+    /// Ids of no experience.
     pub unknown: Vec<i64>,
     /// Attempts.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub attempts: Vec<i64>,
-    /// Numbers of no attempt.
+    /// Ids of no attempt.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub unknown_attempts: Vec<i64>,
 }
@@ -70,12 +70,12 @@ pub fn forget(place: &StorePlace, ids: &[i64], attempts: &[i64]) -> Result<Forgo
     Ok(done)
 }
 
-/// What another store has now.
+/// Result of copying experiences into another store.
 #[derive(Serialize)]
 pub struct Moved {
-    /// Experiences that are new there.
+    /// Experiences that were new to it.
     pub added: usize,
-    /// All that it has.
+    /// All experiences that it has now.
     pub experiences: usize,
     /// Rows that could not be read.
     #[serde(skip_serializing_if = "is_zero")]
@@ -90,12 +90,12 @@ fn is_zero(number: &usize) -> bool {
 #[derive(Default)]
 struct LeftOut {
     rows: usize,
-    /// Those of them that lie on damaged pages.
+    /// Those of them on damaged pages.
     damaged: usize,
 }
 
 impl LeftOut {
-    /// Names a row that is left out; any other error ends the work.
+    /// Reports a row that is left out; any other error ends the work.
     fn row(&mut self, error: StoreError) -> Result<()> {
         match error {
             error if error.is_of_one_row() => eprintln!("left out: {error}"),
@@ -106,7 +106,7 @@ impl LeftOut {
         Ok(())
     }
 
-    /// How many there were.
+    /// Returns how many there were.
     fn count(self, place: &StorePlace) -> usize {
         if self.damaged > 0 {
             eprintln!("left out: {} rows of {place} that lie on damaged pages", self.damaged);
@@ -115,7 +115,7 @@ impl LeftOut {
     }
 }
 
-/// Adds the experiences of a store to another one, as `change` makes them; how many are new.
+/// Adds the experiences of a store, changed by `change`, to another one; returns how many are new.
 fn take_over(
     target: &mut dyn ExperienceStore,
     source: &dyn ExperienceStore,
@@ -140,7 +140,7 @@ fn take_over(
     Ok(added)
 }
 
-/// Takes over experiences and attempts of other stores; damaged ones give what can still be read.
+/// Copies the experiences and attempts of other stores into this one; from damaged stores, the rows that can still be read.
 ///
 /// # Errors
 /// [`StoreError`]; what was taken over until then is kept.
@@ -182,7 +182,7 @@ pub fn refresh(place: &StorePlace, out: &StorePlace, network: &DgcmModel) -> Res
     Ok(Moved { added, experiences: target.list()?.len(), unreadable: left_out.count(place) })
 }
 
-/// What was written as files.
+/// Result of an export.
 #[derive(Serialize)]
 pub struct Exported {
     /// Experiences.
@@ -193,7 +193,7 @@ pub struct Exported {
 }
 
 impl Exported {
-    /// What the command returns.
+    /// The outcome of the command.
     pub fn outcome(&self) -> Outcome {
         match (self.experiences, self.unreadable) {
             (_, 1..) => Outcome::Incomplete,
@@ -203,7 +203,7 @@ impl Exported {
     }
 }
 
-/// Writes all experiences as files; of a damaged store those that can still be read.
+/// Writes all experiences as files; from a damaged store, those that can still be read.
 ///
 /// # Errors
 /// For a store or a folder that cannot be used.

@@ -1,4 +1,4 @@
-//! Simulated trials of grasps as the command line sets them: gripper, mass and friction, the usual setting and a hard one.
+//! Simulated grasp trials as configured on the command line: gripper, mass and friction, the usual setting and a hard one.
 
 use anyhow::{Context, Result};
 use clap::Args;
@@ -28,10 +28,10 @@ pub struct PhysicsArguments {
     pub force: Option<f64>,
 }
 
-/// Gripper and trial as the command line sets them, tested.
+/// Gripper and trial options from the command line, checked.
 ///
 /// # Errors
-/// When the gripper is not known, or a number makes no trial.
+/// When the gripper is unknown, or a number is out of range.
 pub fn physics(a: &PhysicsArguments) -> Result<(Gripper, TrialOptions)> {
     let mut gripper = gripper(&a.gripper)?;
     gripper.friction = a.friction.unwrap_or(gripper.friction);
@@ -52,13 +52,13 @@ pub fn hardness(a: &PhysicsArguments, hard: bool) -> Result<Hardness> {
         return Ok(Hardness::usual(gripper, trial));
     }
     let mut setting = Hardness::hard(gripper, trial);
-    // A --friction or --mass that was asked for holds.
+    // An explicit --friction or --mass takes precedence.
     setting.real.friction = a.friction.unwrap_or(setting.real.friction);
     setting.options.trial.mass = a.mass.unwrap_or(setting.options.trial.mass);
     Ok(setting)
 }
 
-/// The word for an ending in files and tables.
+/// The word for an outcome in files and tables.
 pub fn outcome_name(ending: AttemptOutcome) -> String {
     match serde_json::to_value(ending) {
         Ok(serde_json::Value::String(word)) => word,

@@ -1,4 +1,4 @@
-//! Where backgrounds come from: photographs of a folder, images in memory, or procedural textures.
+//! Sources of backgrounds: photographs of a folder, images in memory, or procedural textures.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -14,12 +14,12 @@ use super::error::AugmentError;
 use super::patch::{AffineMap, Patch};
 use super::texture::procedural_texture;
 
-/// How a folder of photographs is read.
+/// Options for reading a folder of photographs.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PhotographOptions {
     /// Photographs are reduced until their longer side has at most this many pixels.
     pub longest_side: usize,
-    /// At most so many are read, in the order of their names.
+    /// At most this many are read, in the order of their names.
     pub most: usize,
 }
 
@@ -42,7 +42,7 @@ fn reduced(image: RgbImage, side: usize) -> Option<RgbImage> {
     Image::from_vec(pixels.width() as usize, pixels.height() as usize, data).ok()
 }
 
-/// An image and what its crops should keep away from.
+/// An image and the rectangles that its crops should avoid.
 #[derive(Debug, Clone)]
 struct Source {
     image: Arc<RgbImage>,
@@ -57,12 +57,12 @@ pub struct Backgrounds {
 }
 
 impl Backgrounds {
-    /// Textures made from noise: no files are needed.
+    /// Only textures made from noise, without files.
     pub fn procedural() -> Self {
         Backgrounds { sources: Vec::new(), procedural_fraction: 1.0 }
     }
 
-    /// The PNG and JPEG files of a folder, decoded once and kept reduced in memory. Other files are passed over.
+    /// The PNG and JPEG files of a folder, decoded once and kept in memory at reduced size. Other files are skipped.
     ///
     /// # Errors
     /// [`AugmentError`] when the folder cannot be listed or holds no readable photograph.
@@ -97,7 +97,7 @@ impl Backgrounds {
                 files.push(file);
             }
         }
-        // The order in which a system lists files is not the same everywhere.
+        // The order in which files are listed depends on the system.
         files.sort();
         files.truncate(options.most);
         Ok(files)
@@ -118,7 +118,7 @@ impl Backgrounds {
         Ok(backgrounds)
     }
 
-    /// Adds one image; crops of it are looked for that keep away from the rectangles (objects that must not show up).
+    /// Adds one image; its crops avoid the rectangles if possible (objects that must not appear).
     ///
     /// # Errors
     /// [`AugmentError::SmallImage`].
@@ -131,13 +131,13 @@ impl Backgrounds {
         Ok(self)
     }
 
-    /// The fraction of procedural textures between the photographs, 0..1.
+    /// Sets the fraction of procedural textures among the photographs, 0..1.
     pub fn with_procedural_fraction(mut self, share: f32) -> Self {
         self.procedural_fraction = if self.sources.is_empty() { 1.0 } else { share.clamp(0.0, 1.0) };
         self
     }
 
-    /// How many images there are.
+    /// Number of images.
     pub fn images(&self) -> usize {
         self.sources.len()
     }
@@ -154,7 +154,7 @@ impl Backgrounds {
 }
 
 impl Source {
-    /// A random window, flipped half of the time, of between a third of the image and all of it.
+    /// A random window of a third of the image to the whole image, flipped with probability one half.
     fn crop(&self, width: usize, height: usize, random: &mut Random) -> AffineMap {
         let (w, h) = self.image.size();
         let largest = f32::min((w - 1) as f32 / width as f32, (h - 1) as f32 / height as f32);

@@ -7,15 +7,14 @@ use sixfold_geometry::random::{Random, uniform};
 use super::error::AugmentError;
 use super::patch::Patch;
 
-/// Ranges and chances of each change. Values are those of images in 0..1; a range of two equal neutral numbers turns
-/// its change off.
+/// Ranges and probabilities of each change, for image values in 0..1. A range of two equal neutral numbers disables its change.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ColorAugmentation {
-    /// Added to each channel by itself.
+    /// Offset, sampled separately for each channel.
     pub add: [f32; 2],
-    /// Contrast about 0.5, all channels alike.
+    /// Contrast about 0.5, the same for all channels.
     pub contrast: [f32; 2],
-    /// Factor on all channels, or with probability `multiply_per_channel` one for each.
+    /// Factor on all channels or, with probability `multiply_per_channel`, one for each.
     pub multiply: [f32; 2],
     /// Probability that the factor differs between channels.
     pub multiply_per_channel: f32,
@@ -27,16 +26,16 @@ pub struct ColorAugmentation {
     pub noise: [f32; 2],
     /// Probability of a second, stronger contrast.
     pub strong_contrast_probability: f32,
-    /// The stronger contrast, about the patch's mean (about 0.5, dark objects would become black); per channel with
-    /// probability 0.3.
+    /// The stronger contrast, about the patch's mean (about 0.5 it would make dark objects black); per channel with probability
+    /// 0.3.
     pub strong_contrast: [f32; 2],
     /// Probability of the three changes below.
     pub tone_probability: f32,
     /// Exponent on each value.
     pub gamma: [f32; 2],
-    /// Turn of the hue, radians.
+    /// Rotation of the hue, radians.
     pub hue: [f32; 2],
-    /// Factor on the distance to grey.
+    /// Factor on the difference from grey.
     pub saturation: [f32; 2],
 }
 
@@ -60,7 +59,7 @@ impl ColorAugmentation {
         }
     }
 
-    /// Table 3.2 alone.
+    /// The ranges of table 3.2.
     pub fn table_3_2() -> Self {
         ColorAugmentation {
             add: [-15.0 / 255.0, 15.0 / 255.0],
@@ -72,8 +71,8 @@ impl ColorAugmentation {
         }
     }
 
-    /// Table 4.1: that of the photographs that new views are put together from. (The table's noise has a standard deviation of 10;
-    /// here it is anything up to that.)
+    /// The ranges of table 4.1, for the source images of new views. (The table's noise has a standard deviation of 10; here it is
+    /// uniform up to that.)
     pub fn table_4_1() -> Self {
         ColorAugmentation {
             multiply_per_channel: 0.0,
@@ -142,7 +141,7 @@ impl ColorAugmentation {
         let mut order =
             [Step::Add, Step::Contrast, Step::Multiply, Step::Blur, Step::Noise, Step::Strong, Step::Tone];
         order.shuffle(random);
-        // Runs of changes of the form a v + b become one pass over the pixels.
+        // Consecutive changes of the form a v + b are combined into one pass over the pixels.
         let mut linear = Linear::identity();
         for step in order {
             match step {
@@ -160,7 +159,7 @@ impl ColorAugmentation {
                     }
                 }
                 Step::Blur => {
-                    // Commutes with what is linear.
+                    // The blur commutes with linear changes.
                     patch.blur(uniform(random, self.blur));
                 }
                 Step::Noise => {
@@ -238,7 +237,7 @@ fn mean(patch: &Patch) -> f32 {
     sum / count.max(1.0)
 }
 
-/// Noise that is nearly Gaussian: the sum of four uniform bytes.
+/// Adds approximately Gaussian noise: the sum of four uniform bytes.
 fn add_noise(patch: &mut Patch, deviation: f32, random: &mut Random) {
     // Four uniform bytes have the variance 4 * (256^2 - 1) / 12.
     let scale = deviation / 147.8;
@@ -249,9 +248,9 @@ fn add_noise(patch: &mut Patch, deviation: f32, random: &mut Random) {
     }
 }
 
-/// Turns hue by `angle` and multiplies saturation, both about the grey axis.
+/// Rotates the hue by `angle` and multiplies the saturation, both about the grey axis.
 fn turn_hue(patch: &mut Patch, angle: f32, saturation: f32) {
-    // Rodrigues about (1, 1, 1) / sqrt 3, then a scaling of what is perpendicular to that axis.
+    // Rodrigues' rotation about (1, 1, 1) / sqrt 3, then a scaling perpendicular to that axis.
     let (s, c) = angle.sin_cos();
     let third = 1.0 / 3.0;
     let side = s / 3.0f32.sqrt();
@@ -271,7 +270,7 @@ fn turn_hue(patch: &mut Patch, angle: f32, saturation: f32) {
     }
 }
 
-/// Raises each value to a power, from a table: `powf` on every pixel costs more than all the rest.
+/// Raises each value to a power with a lookup table: `powf` on every pixel would cost more than all other changes.
 fn raise(patch: &mut Patch, gamma: f32) {
     const STEPS: usize = 255;
     let table: [f32; STEPS + 2] = std::array::from_fn(|i| ((i.min(STEPS)) as f32 / STEPS as f32).powf(gamma));

@@ -1,4 +1,4 @@
-//! One channel over a patch: how much of each pixel something covers, in 0..1.
+//! One channel over a patch: the covered fraction of each pixel, in 0..1.
 
 use super::blur::gaussian;
 use rand::RngExt;
@@ -37,7 +37,7 @@ impl Coverage {
         gaussian(&mut self.data, self.width, self.height, sigma);
     }
 
-    /// Takes `other` away: what remains visible behind it.
+    /// Removes `other`, leaving what remains visible behind it.
     pub fn remove(&mut self, other: &Coverage) {
         self.data.iter_mut().zip(&other.data).for_each(|(a, b)| *a *= 1.0 - b);
     }
@@ -60,7 +60,7 @@ impl Coverage {
         top + (bottom - top) * fy
     }
 
-    /// Another resolution of the same area: each pixel's value at the centre of its block.
+    /// The same area at another resolution: each pixel has the value at its centre.
     pub fn resampled(&self, width: usize, height: usize) -> Coverage {
         if (width, height) == (self.width, self.height) {
             return self.clone();
@@ -72,8 +72,8 @@ impl Coverage {
         })
     }
 
-    /// A mask as a network would predict it: grown or shrunk by about `grow` pixels with a border that wobbles by
-    /// about `wobble` pixels, then cut at one half (so 0 or 1).
+    /// A mask as a network would predict it: grown or shrunk by about `grow` pixels, with a border disturbed by
+    /// about `wobble` pixels, then thresholded at one half (so 0 or 1).
     pub fn disturbed(&self, grow: f32, wobble: f32, random: &mut Random) -> Coverage {
         // The edge of a mask blurred by sigma falls from 1 to 0 about linearly over 2.5 sigma.
         let reach = (grow.abs() + wobble).max(1.0);

@@ -1,4 +1,4 @@
-//! Cut-out images of objects: pasted behind an object as clutter, or in front of it to hide a part.
+//! Cut-out images of objects, pasted behind an object as clutter or in front of it as occluders.
 
 use rand::RngExt;
 use sixfold_geometry::random::{Random, uniform};
@@ -17,7 +17,7 @@ pub struct Cutout {
 }
 
 impl Cutout {
-    /// What `mask` shows of `image`, cut to its box; `None` when the mask is empty or of another size.
+    /// The pixels of `image` in `mask`, cropped to their box; `None` when the mask is empty or of another size.
     pub fn new(image: &RgbImage, mask: &Mask) -> Option<Cutout> {
         if image.size() != mask.size() {
             return None;
@@ -48,8 +48,8 @@ impl Cutout {
         (self.width, self.height)
     }
 
-    /// Draws the cut-out, rotated and scaled about its centre, which comes to lie at `centre`: its colours and coverage
-    /// over a patch of the given size. `longest` is the length of its longer side in patch pixels.
+    /// Draws the cut-out, rotated and scaled about its centre, with its centre at `centre`. Returns its colours and
+    /// coverage over a patch of the given size. `longest` is the length of its longer side in patch pixels.
     pub fn draw(
         &self,
         width: usize,
@@ -87,7 +87,7 @@ impl Cutout {
         (patch, cover)
     }
 
-    /// Bilinear colour and coverage; what is not covered has no say in the colour.
+    /// Bilinear colour and coverage; uncovered pixels do not contribute to the colour.
     fn sample(&self, u: f32, v: f32) -> ([f32; 3], f32) {
         let (x, y) = (u.floor(), v.floor());
         if !(x >= -1.0 && y >= -1.0 && x < self.width as f32 && y < self.height as f32) {
@@ -113,8 +113,9 @@ impl Cutout {
         (color.map(|c| c / (255.0 * covered.max(1e-6))), covered)
     }
 
-    /// Draws the cut-out so that it hides about `fraction` of what `visible` shows: among places from outside the
-    /// object to its middle, in a random direction, the one that comes nearest. `None` when nothing is visible.
+    /// Draws the cut-out so that it hides about `fraction` of `visible`: of several places between the outside of the
+    /// object and its centre, in a random direction, the one with the closest fraction is used. `None` when nothing is
+    /// visible.
     pub fn draw_over(
         &self,
         visible: &Coverage,
@@ -158,7 +159,7 @@ impl Cutout {
             hit.count() as f32 / sum
         };
         let farthest = 0.5 * (visible.width.max(visible.height) as f32 * 0.8 + longest);
-        // A little off the line, so that shapes do not always meet in the middle.
+        // Slightly beside the line, so that shapes are not always aligned with the centre.
         let side = uniform(random, [-0.2, 0.2]) * longest;
         let places = (0..12).map(|i| {
             let r = farthest * (1.0 - (i as f32 + random.random::<f32>()) / 12.0);

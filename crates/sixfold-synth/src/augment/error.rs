@@ -1,4 +1,4 @@
-//! What can be wrong with what a user gives: folders, images, options.
+//! Errors in a user's input: folders, images, options.
 
 use std::path::PathBuf;
 
@@ -13,7 +13,7 @@ pub enum AugmentError {
     Folder {
         /// The folder.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
     /// There is no usable photograph.
@@ -27,7 +27,7 @@ pub enum AugmentError {
     /// An image given in memory is too small.
     #[error("background image {index}: found {width}x{height} pixels, expected at least 8x8")]
     SmallImage {
-        /// Its place in the list.
+        /// Its index in the list.
         index: usize,
         /// Columns.
         width: usize,
@@ -39,9 +39,9 @@ pub enum AugmentError {
     Option {
         /// Name of the option.
         field: &'static str,
-        /// What it held.
+        /// Its value.
         found: String,
-        /// What it should hold.
+        /// The expected value.
         expected: &'static str,
     },
 }

@@ -1,11 +1,11 @@
 //! Image augmentation, occluders, procedural backgrounds and textures for training networks on few images.
 //!
-//! Works on small patches of colour ([`Patch`], planar `f32` in 0..1) and of one channel ([`Coverage`]): a network's
-//! input, not a photograph. Everything random takes the caller's generator
-//! ([`stream`](sixfold_geometry::random::stream) makes one per sample), so that a
-//! sample is a function of seed and number alone, whatever thread draws it.
+//! The functions work on small patches of colour ([`Patch`], planar `f32` in 0..1) and of one channel
+//! ([`Coverage`]), of the size of a network's input. All random functions take the caller's generator
+//! ([`stream`](sixfold_geometry::random::stream) makes one per sample), so that a sample depends only on the seed
+//! and its number, on any thread.
 //!
-//! Colour augmentation after K. Park, dissertation, table 3.2; occluders after table 3.3.
+//! Colour augmentation follows K. Park, dissertation, table 3.2; occluders follow table 3.3.
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
 

@@ -1,16 +1,16 @@
-//! Value noise: random numbers on a grid, blended between.
+//! Value noise: random numbers on a grid, interpolated.
 
 use rand::RngExt;
 use sixfold_geometry::random::Random;
 
-/// Smooth noise in 0..1: random numbers on a grid of `cells` by `cells`, blended between with a smooth step.
+/// Smooth noise in 0..1: random numbers on a grid of `cells` by `cells`, interpolated with a smooth step.
 pub(super) fn value_noise(width: usize, height: usize, cells: usize, random: &mut Random) -> Vec<f32> {
     let mut out = vec![0.0; width * height];
     add_noise(&mut out, width, height, cells, 1.0, random);
     out
 }
 
-/// Adds such noise, `weight` times as strong.
+/// Adds such noise, multiplied by `weight`.
 pub(super) fn add_noise(
     out: &mut [f32],
     width: usize,

@@ -1,4 +1,4 @@
-//! A small colour image in planes, and how one is cut out of a photograph.
+//! A small planar colour image, and cropping one from a photograph.
 
 use sixfold_geometry::RgbImage;
 
@@ -18,7 +18,7 @@ pub struct AffineMap {
 }
 
 impl AffineMap {
-    /// Where a patch pixel lies in the image.
+    /// The image position of a patch pixel.
     pub fn apply(&self, x: f32, y: f32) -> [f32; 2] {
         [self.x[0] * x + self.x[1] * y + self.x[2], self.y[0] * x + self.y[1] * y + self.y[2]]
     }
@@ -28,7 +28,7 @@ impl AffineMap {
         (self.x[0] * self.y[1] - self.x[1] * self.y[0]).abs().sqrt()
     }
 
-    /// For a map with a scale near 2 or more: image pixels between taps that average out what would alias.
+    /// Number of taps per side, which are averaged against aliasing for a map with a scale near 2 or more.
     fn taps(&self) -> usize {
         (self.scale().round() as usize).clamp(1, 4)
     }
@@ -55,7 +55,7 @@ impl Patch {
         Patch { width, height, data }
     }
 
-    /// The whole of an 8-bit image.
+    /// A patch of a whole 8-bit image.
     pub fn from_rgb(image: &RgbImage) -> Self {
         let (width, height) = image.size();
         let pixels = width * height;
@@ -68,7 +68,7 @@ impl Patch {
         Patch { width, height, data }
     }
 
-    /// As an 8-bit image; values outside 0..1 are cut.
+    /// The patch as an 8-bit image; values are clamped to 0..1.
     pub fn to_rgb(&self) -> RgbImage {
         let pixels = self.width * self.height;
         RgbImage::from_fn(self.width, self.height, |x, y| {
@@ -83,8 +83,8 @@ impl Patch {
         self.data.chunks_exact_mut((self.width * self.height).max(1))
     }
 
-    /// Cuts a patch out of an image, bilinearly (an average over several taps where the image is reduced). Also says
-    /// which pixels lie inside the image; the others are `outside`.
+    /// Crops a patch from an image, with bilinear interpolation (an average over several taps where the image is
+    /// reduced). Also returns which pixels are inside the image; the others have the colour `outside`.
     pub fn warp(
         image: &RgbImage,
         map: &AffineMap,
@@ -102,13 +102,14 @@ impl Patch {
         let source = image.as_slice();
         let taps = map.taps();
         let weight = 1.0 / (255.0 * (taps * taps) as f32);
-        // Fixed point with 16 bits behind the point: conversions of floats cost more than the rest of a pixel.
+        // Fixed point with 16 fractional bits: float conversions would cost more than the rest of a pixel's
+        // computation.
         let fixed = |v: f32| (f64::from(v) * 65536.0) as i64;
         let offsets: Vec<[i64; 2]> = (0..taps * taps)
             .map(|k| {
                 let at = |k: usize| (k as f32 + 0.5) / taps as f32 - 0.5;
                 let (i, j) = (at(k % taps), at(k / taps));
-                // Half a pixel on top, so that cutting rounds.
+                // Half a pixel is added, so that truncation rounds.
                 [fixed(map.x[0] * i + map.x[1] * j + 0.5), fixed(map.y[0] * i + map.y[1] * j + 0.5)]
             })
             .collect();
@@ -137,7 +138,7 @@ impl Patch {
                         above * (1.0 - fy) + below * fy
                     });
                 } else {
-                    // The taps lie about a pixel apart: the nearest pixel of each will do.
+                    // The taps are about a pixel apart, so the nearest pixel of each is enough.
                     let mut total = [0u32; 3];
                     for [du, dv] in &offsets {
                         let x0 = ((u + du).clamp(0, largest_u) >> 16) as usize;
@@ -157,7 +158,7 @@ impl Patch {
         (patch, inside)
     }
 
-    /// Draws `over` where `coverage` says.
+    /// Draws `over`, blended by `coverage`.
     pub fn blend(&mut self, over: &Patch, coverage: &Coverage) {
         let pixels = (self.width * self.height).max(1);
         for (under, over) in self.data.chunks_exact_mut(pixels).zip(over.data.chunks_exact(pixels)) {
@@ -173,8 +174,8 @@ impl Patch {
         self.planes_mut().for_each(|plane| gaussian(plane, width, height, sigma));
     }
 
-    /// Blurs only the borderline of something drawn into the patch: the band where the coverage, blurred by `sigma`,
-    /// is neither 0 nor 1 (dissertation, section 3.4.1: the borderlines are blurred to make smooth boundaries).
+    /// Blurs only the border of something drawn into the patch: the band where the coverage, blurred by `sigma`, is
+    /// neither 0 nor 1 (dissertation, section 3.4.1: the borderlines are blurred to make smooth boundaries).
     pub fn soften_border(&mut self, coverage: &Coverage, sigma: f32) {
         if sigma.is_nan() || sigma < super::blur::MIN_SIGMA {
             return;
@@ -187,7 +188,7 @@ impl Patch {
         self.blend(&soft, &band);
     }
 
-    /// Cuts all values to 0..1.
+    /// Clamps all values to 0..1.
     pub fn clamp(&mut self) {
         self.data.iter_mut().for_each(|v| *v = v.clamp(0.0, 1.0));
     }

@@ -1,9 +1,9 @@
 //! Shapes that hide a chosen fraction of an object (dissertation, table 3.3): rectangles, ellipses, polygons, blobs and
 //! straight edges.
 //!
-//! Every shape is a function that grows outwards from its centre: a pixel lies inside the shape of size `s` when its
-//! level is at most `s`. So the size that hides a wanted fraction is a quantile of the levels over the object's pixels,
-//! and no search is needed.
+//! Every shape is defined by a level function that increases outwards from its centre: a pixel is inside the shape of
+//! size `s` if its level is at most `s`. The size that hides a given fraction is therefore a quantile of the levels
+//! over the object's pixels, and no search is needed.
 
 use rand::RngExt;
 use sixfold_geometry::random::{Random, uniform};
@@ -45,7 +45,7 @@ pub enum Shape {
 }
 
 impl Shape {
-    /// One of the kinds, at random.
+    /// A shape of a random kind.
     pub fn random(random: &mut Random) -> Shape {
         let angle = uniform(random, [0.0, std::f32::consts::TAU]);
         let turn = [angle.cos(), angle.sin()];
@@ -107,18 +107,18 @@ impl Shape {
         }
     }
 
-    /// The shape of a size about a centre, with an edge about one pixel wide.
+    /// Draws the shape with a size and centre, with an edge about one pixel wide.
     pub fn draw(&self, width: usize, height: usize, centre: [f32; 2], size: f32) -> Coverage {
         Coverage::from_fn(width, height, |x, y| {
             let level = self.level(x as f32 - centre[0], y as f32 - centre[1]);
-            // Levels count pixels along the longest axis.
+            // Levels are in pixels along the longest axis.
             (size - level + 0.5).clamp(0.0, 1.0)
         })
     }
 }
 
-/// A shape about `centre` that hides `fraction` of what `visible` shows. `None` when nothing is visible or the fraction
-/// is less than a pixel.
+/// A shape about `centre` that hides `fraction` of `visible`. `None` when nothing is visible or the fraction is less
+/// than a pixel.
 pub fn occluder_of_fraction(
     shape: &Shape,
     centre: [f32; 2],

@@ -25,7 +25,7 @@ fn fractal(width: usize, height: usize, random: &mut Random) -> Vec<f32> {
         weight *= persistence;
         cells = cells * 2 + random.random_range(0..2usize);
     }
-    // A sum of octaves crowds about one half: stretch it.
+    // A sum of octaves is concentrated around one half: stretch it.
     let scale = 1.0 / f32::max(sum, 1e-6);
     out.iter_mut().for_each(|v| *v = ((*v * scale - 0.5) * 1.7 + 0.5).clamp(0.0, 1.0));
     out
@@ -57,7 +57,7 @@ pub fn procedural_texture(width: usize, height: usize, random: &mut Random) -> P
         data.iter_mut().for_each(|v| *v = ((*v - 0.5) * sharp + 0.5).clamp(0.0, 1.0));
         patch.blend(&other, &Coverage { width, height, data });
     }
-    // Scattered shapes: edges and corners as a desk full of things has.
+    // Scattered shapes: edges and corners as on a cluttered desk.
     for _ in 0..random.random_range(0..5u32) {
         let shape = Shape::random(random);
         let side = width.max(height) as f32;
@@ -86,7 +86,7 @@ fn layer(width: usize, height: usize, random: &mut Random) -> Patch {
         0..=4 => {
             let mut patch = colored(&fractal(width, height, random), width, height, low, high);
             if random.random::<f32>() < 0.4 {
-                // Each channel its own noise: colourful.
+                // Separate noise for each channel, which makes it colourful.
                 let amount = uniform(random, [0.1, 0.5]);
                 let pixels = width * height;
                 for channel in 0..3 {

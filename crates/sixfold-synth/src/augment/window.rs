@@ -1,4 +1,4 @@
-//! The square window that a crop shows, and how crop pixels relate to those of the photograph.
+//! The square window of a crop, and the map between crop pixels and photograph pixels.
 
 use sixfold_geometry::{Camera, Vec2};
 
@@ -7,7 +7,7 @@ use super::patch::AffineMap;
 /// A square part of the image plane, pixels; pixel centres at whole numbers.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Window {
-    /// Its middle.
+    /// Its centre.
     pub centre: Vec2,
     /// Its side.
     pub side: f64,
@@ -29,7 +29,8 @@ impl Window {
         }
     }
 
-    /// From pixels of the crop (`size x size`, of the photograph rotated by `turn` radians) to the photograph's.
+    /// The map from pixels of the crop (`size x size`, of the photograph rotated by `turn` radians) to those of
+    /// the photograph.
     pub fn map(&self, camera: &Camera, size: usize, turn: f64) -> AffineMap {
         let step = self.side / size as f64;
         let (s, c) = turn.sin_cos();

@@ -1,9 +1,9 @@
-//! Families of objects made by a procedure: can, mug, cup, bottle, bowl, box, clamp and drill. DGCM-Net learns from
-//! them and from nothing else, NOL paints them, and a simulated robot collects its first experience on them.
+//! Families of procedural objects: can, mug, cup, bottle, bowl, box, clamp and drill. DGCM-Net is trained only on them,
+//! NOL on painted versions of them, and a simulated robot collects its first experience with them.
 //!
 //! The dissertation trains on scanned objects whose axes are stretched at random (section 6.2.2). Here the members of a
-//! family differ in more than that (taper, handle, neck, ...), and still every face of one member has its counterpart on
-//! another (`solids.rs`). Real objects are thereby all held out. [`toy`] draws what belongs to no family.
+//! family also differ in taper, handle, neck and more, yet every face of one member has its counterpart on another
+//! (`solids.rs`). Real objects are therefore all held out. [`toy`] makes objects that belong to no family.
 
 pub(crate) mod solids;
 mod sweep;
@@ -49,7 +49,7 @@ pub enum Family {
 }
 
 impl Family {
-    /// All of them.
+    /// All families.
     pub const ALL: [Family; 8] = [
         Family::Can,
         Family::Mug,
@@ -85,8 +85,9 @@ impl Family {
         }
     }
 
-    /// The yaw angles between which views of it differ, radians: none for what looks the same from all sides, a quarter
-    /// turn for boxes (a further rotation is another box: the ambiguity of section 6.3.2), half a turn for what lies.
+    /// The range of yaw angles over which views of it differ, radians: 0 for objects that look the same from all sides,
+    /// a quarter turn for boxes (a further rotation gives another box: the ambiguity of section 6.3.2), half a turn for
+    /// lying objects.
     pub fn yaw_range(self, rest: Rest) -> f64 {
         match (self, rest) {
             (Family::Can | Family::Bottle | Family::Cup | Family::Bowl, Rest::Upright) => 0.0,
@@ -97,7 +98,7 @@ impl Family {
     }
 }
 
-/// How an object lies on the table.
+/// The resting orientation of an object on the table.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Rest {
@@ -129,7 +130,7 @@ pub struct Member {
     pub family: Family,
     /// Its surface, metres, in its own frame.
     pub mesh: Mesh,
-    /// Names of its parts with the first face after each.
+    /// Names of its parts, each with the index of the first face after it.
     pub parts: Vec<(&'static str, usize)>,
 }
 
@@ -154,7 +155,7 @@ impl Member {
 /// Range of the factors by which the axes of a member are stretched: table 6.1.
 pub(crate) const AXIS_SCALE: (f64, f64) = (0.8, 1.5);
 
-/// Draws a member of a family.
+/// Makes a random member of a family.
 ///
 /// # Errors
 /// [`MeshError`]: never with these numbers.
@@ -183,7 +184,7 @@ pub fn member(family: Family, random: &mut impl Rng) -> Result<Member, MeshError
             parts.push(("body", b.faces()));
             let (reach, span) = (between(0.018, 0.032), h * between(0.5, 0.75));
             let (middle, squareness) = (h * between(0.47, 0.58), between(0.5, 1.0));
-            // A half ellipse whose corners are more or less full, beginning inside the wall.
+            // A half superellipse of random fullness, beginning inside the wall.
             let path: Vec<Vec3> = (0..=14)
                 .map(|k| {
                     let angle = PI * (f64::from(k) / 14.0 - 0.5);
@@ -292,7 +293,7 @@ pub fn member(family: Family, random: &mut impl Rng) -> Result<Member, MeshError
     Ok(Member { family, mesh: b.finish(&scale)?, parts })
 }
 
-/// A cup: foot narrower than the rim by `taper`.
+/// A cup whose foot is narrower than the rim by `taper`.
 fn vessel(b: &mut Builder, r: f64, h: f64, taper: f64, wall: f64) {
     let floor = 1.5 * wall;
     b.lathed(&profiles::cup(taper * r, r, h, wall, floor), SIDES, 6);
@@ -326,7 +327,7 @@ mod tests {
                 let (low, high) = m.mesh.bounding_box();
                 let size = high - low;
                 assert!(size.max() < 0.3 && size.min() > 0.008, "{family:?} {size:?}");
-                // Every part is closed and its faces look outwards.
+                // Every part is closed and its faces face outwards.
                 let mut start = 0;
                 for (name, end) in &m.parts {
                     let part = Mesh::new(m.mesh.vertices().to_vec(), m.mesh.faces()[start..*end].to_vec());

@@ -1,6 +1,6 @@
-//! Solids that a family is put together from. The numbers of vertices and faces depend on nothing but the counts that are
-//! asked for, so that face `k` of one instance is the same place as face `k` of another: that is what makes
-//! correspondences between two instances known.
+//! The solids of which families are composed. The numbers of vertices and faces depend only on the requested counts, so
+//! that face `k` of one instance corresponds to face `k` of another. This gives exact correspondences between two
+//! instances.
 
 use std::f64::consts::TAU;
 
@@ -17,8 +17,9 @@ pub(crate) fn rings(profile: &[(f64, f64)], sides: usize) -> impl Iterator<Item 
     })
 }
 
-/// Faces between two rings of vertices, given by their first ones, that run to the right when seen from outside with the
-/// first ring below: of each side the face with an edge on the lower ring, then the one with an edge on the upper.
+/// Faces between two rings of vertices, given by their first vertices. The rings run to the right when seen from outside
+/// with the first ring below. For each side, the face with an edge on the lower ring comes first, then the one with an
+/// edge on the upper ring.
 pub(crate) fn band(below: usize, above: usize, sides: usize) -> impl Iterator<Item = [[u32; 3]; 2]> {
     (0..sides).map(move |k| {
         let next = (k + 1) % sides;
@@ -27,7 +28,7 @@ pub(crate) fn band(below: usize, above: usize, sides: usize) -> impl Iterator<It
     })
 }
 
-/// Vertices and faces in the making.
+/// A builder of vertices and faces.
 #[derive(Debug, Default)]
 pub(super) struct Builder {
     vertices: Vec<Vec3>,
@@ -35,7 +36,7 @@ pub(super) struct Builder {
 }
 
 impl Builder {
-    /// How many faces there are so far.
+    /// Number of faces so far.
     pub(crate) fn faces(&self) -> usize {
         self.faces.len()
     }
@@ -46,7 +47,7 @@ impl Builder {
     }
 
     /// The shape that a profile of (radius, height) points sweeps about z, the solid on the profile's left hand (radius to
-    /// the right, height up). Every piece of the profile is cut into `rows`.
+    /// the right, height up). Every segment of the profile is divided into `rows`.
     pub(crate) fn lathed(&mut self, profile: &[(f64, f64)], sides: usize, rows: usize) {
         let mut fine = vec![];
         for pair in profile.windows(2) {
@@ -65,11 +66,11 @@ impl Builder {
 
     /// [`band`], added to the faces.
     fn band(&mut self, below: usize, above: usize, sides: usize) {
-        // Faces on an axis have no area, but they keep the count.
+        // Faces on an axis have no area, but keep the face count constant.
         self.faces.extend(band(below, above, sides).flatten());
     }
 
-    /// A box with these side lengths, its middle at `pose`, every side cut into `cells` times `cells`.
+    /// A box with these side lengths, centred at `pose`, every side divided into `cells` times `cells`.
     pub(crate) fn cuboid(&mut self, size: &Vec3, pose: &Pose, cells: usize) {
         for axis in 0..3 {
             for sign in [-1.0, 1.0] {

@@ -1,13 +1,13 @@
-//! One solid for everything that toys are made of: a section (ellipse to rectangle) that grows and shrinks along a straight
-//! or bent path. Ellipsoids, superquadrics (Barr 1981, "Superquadrics and angle-preserving transformations"), bars, cones
-//! and lathed shapes differ in their profile only.
+//! The one kind of solid for toys: a section (ellipse to rectangle) of varying size along a straight or bent path.
+//! Ellipsoids, superquadrics (Barr 1981, "Superquadrics and angle-preserving transformations"), bars, cones and lathed
+//! shapes differ only in their profiles.
 
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
 use sixfold_geometry::Vec3;
 use sixfold_mesh::{Mesh, MeshError};
 
-/// A solid of length 1 that begins at the origin and goes along z, bent in the xz plane.
+/// A solid of length 1 that starts at the origin along z and bends in the xz plane.
 #[derive(Debug, Clone)]
 pub(super) struct Sweep {
     /// (fraction of the path, fraction of the radii), from the beginning to the end.
@@ -16,7 +16,7 @@ pub(super) struct Sweep {
     pub radii: (f64, f64),
     /// Exponent of the section: 1 an ellipse, towards 0 a rectangle, 2 a rhombus.
     pub section: f64,
-    /// Angle by which the path turns towards x, radians.
+    /// Angle by which the path bends towards x, radians.
     pub bend: f64,
 }
 
@@ -38,7 +38,7 @@ impl Sweep {
                 let s = k as f64 / rows as f64;
                 let radius = points.windows(2).find(|pair| s <= pair[1].0).map_or(0.05, |pair| {
                     let t = (s - pair[0].0) / (pair[1].0 - pair[0].0).max(1e-9);
-                    // Level at both ends of each piece: lathed wood rather than sheet metal.
+                    // Zero slope at both ends of each segment, for smooth profiles.
                     let t = t * t * (3.0 - 2.0 * t);
                     pair[0].1 + t * (pair[1].1 - pair[0].1)
                 });
@@ -47,7 +47,7 @@ impl Sweep {
             .collect()
     }
 
-    /// The path's point and the direction across it in the plane of the bend.
+    /// The path's point, and the direction perpendicular to the path in the plane of the bend.
     fn at(&self, s: f64) -> (Vec3, Vec3) {
         let angle = self.bend * s;
         let point = if self.bend.abs() < 1e-6 {
@@ -58,7 +58,7 @@ impl Sweep {
         (point, Vec3::new(angle.cos(), 0.0, -angle.sin()))
     }
 
-    /// Its surface: closed, the faces look outwards.
+    /// Its closed surface; the faces face outwards.
     pub(crate) fn mesh(&self, sides: usize) -> Result<Mesh, MeshError> {
         let mut vertices = Vec::with_capacity(self.profile.len() * sides + 2);
         for &(s, radius) in &self.profile {
@@ -119,7 +119,7 @@ mod tests {
         let bar = Sweep { profile, radii: (0.1, 0.2), section: 1.0, bend: 0.0 };
         let expected = PI * 0.02;
         assert!((volume(&bar.mesh(40).unwrap()) - expected).abs() < 0.03 * expected);
-        // Pappus: the volume is the section times the way of its centre.
+        // Pappus' theorem: the volume is the section's area times the path length of its centre.
         let bent = Sweep { bend: 1.5, ..bar };
         assert!((volume(&bent.mesh(40).unwrap()) - expected).abs() < 0.03 * expected);
     }

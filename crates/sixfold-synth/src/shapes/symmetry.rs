@@ -1,4 +1,4 @@
-//! The symmetries that members of a family have by the way they are made.
+//! The symmetries of a family's members, which follow from their construction.
 
 use std::f64::consts::PI;
 
@@ -9,7 +9,8 @@ use sixfold_mesh::{ContinuousSymmetry, ModelInfo};
 use super::{Family, Member};
 
 impl Member {
-    /// Diameter, box and symmetries. A lathed solid that is stretched along one axis keeps half a rotation only.
+    /// Diameter, box and symmetries. A lathed solid that is stretched along one axis keeps only the rotation by
+    /// 180 degrees.
     pub fn info(&self) -> ModelInfo {
         let mut info = ModelInfo::of_mesh(&self.mesh);
         let (low, high) = self.mesh.bounding_box();

@@ -1,8 +1,8 @@
-//! Toys: synthetic objects that belong to no family. A network that shall distinguish objects it has never seen needs more of
-//! them than eight families give: the dissertation trains on the very objects that it is tested on.
+//! Toys: synthetic objects that belong to no family. A network that has to distinguish unknown objects needs more variety
+//! than eight families provide. (The dissertation trains on the same objects that it tests.)
 //!
-//! Every toy is 3 to 8 solids (`sweep.rs`, boxes) that grow into one another: figures with a plane of mirror symmetry (body,
-//! head, ears, limbs, beak, tail), machine parts (plates with a window and posts, brackets, tools), and heaps without a plan.
+//! Every toy consists of 3 to 8 overlapping solids (`sweep.rs`, boxes): figures with a plane of mirror symmetry (body, head,
+//! ears, limbs, beak, tail), machine parts (plates with a window and posts, brackets, tools), and random heaps.
 
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 
@@ -21,8 +21,8 @@ pub(crate) const TOY_MIN_SIDE: f64 = 0.03;
 /// Maximum number of solids in a toy.
 const MOST: usize = 8;
 
-/// Draws a toy: 1,500 to 6,000 faces, metres, z up, standing on z = 0 over the origin, its diameter in `TOY_DIAMETER` (each
-/// as likely as any other). Its solids overlap, so parts of their surfaces lie inside.
+/// Makes a random toy: 1,500 to 6,000 faces, metres, z up, standing on z = 0 over the origin, with a diameter uniform in
+/// `TOY_DIAMETER`. Its solids overlap, so parts of their surfaces are inside it.
 ///
 /// # Errors
 /// [`MeshError`]: never with these numbers.
@@ -37,10 +37,10 @@ pub fn toy(random: &mut impl Rng) -> Result<Mesh, MeshError> {
     standing(&mesh, diameter)
 }
 
-/// Of this diameter, not too thin, standing on z = 0.
+/// The mesh scaled to this diameter, not too thin, standing on z = 0.
 fn standing(mesh: &Mesh, diameter: f64) -> Result<Mesh, MeshError> {
     let mut mesh = mesh.scaled(diameter / mesh.diameter());
-    // Widening also lengthens the diameter a little, so that a second and third round may be needed.
+    // Widening also increases the diameter a little, so a second and third round may be needed.
     for _ in 0..12 {
         let (low, high) = mesh.bounding_box();
         let size = high - low;
@@ -58,7 +58,7 @@ fn standing(mesh: &Mesh, diameter: f64) -> Result<Mesh, MeshError> {
     Ok(mesh.transformed(&Pose::from_translation(-Vec3::new(middle.x, middle.y, low.z))))
 }
 
-/// Body, head and what grows out of them, the same on both sides of the plane y = 0.
+/// Body, head and attached parts, the same on both sides of the plane y = 0.
 fn figure(random: &mut impl Rng) -> Result<Vec<Mesh>, MeshError> {
     let upright = random.random::<f64>() < 0.5;
     let lean = if upright { between(random, -0.2, 0.2) } else { between(random, 0.9, 1.7) };
@@ -83,7 +83,7 @@ fn figure(random: &mut impl Rng) -> Result<Vec<Mesh>, MeshError> {
     };
     let back = if upright { Vec3::new(-1.0, 0.0, -0.6) } else { Vec3::new(-1.0, 0.0, 0.3) };
     let low = between(random, -1.2, -0.4);
-    // What may grow, on the head or the body, in which direction, how long, and how often it does.
+    // Parts that may be attached: on head or body, direction, length and probability.
     let growths = [
         (&head, Vec3::new(between(random, -0.4, 0.3), 0.6, 0.7), (0.1, 0.4), 0.6),
         (&body, Vec3::new(0.5, 0.6, low), (0.2, 0.6), 0.7),
@@ -143,7 +143,7 @@ fn plate(random: &mut impl Rng) -> Result<Vec<Mesh>, MeshError> {
     let posts = random.random_range(2..=(MOST - parts.len()).min(4));
     for _ in 0..posts {
         let tall = between(random, 0.15, 0.8);
-        // On the rim, so that it also stands on a plate with a window.
+        // On the rim, so that it also fits a plate with a window.
         let (x, y) = (between(random, -0.42, 0.42), between(random, -0.42, 0.42) * width);
         let (x, y) = if random.random::<f64>() < 0.5 {
             (x, 0.42 * width * y.signum())
@@ -165,7 +165,7 @@ fn plate(random: &mut impl Rng) -> Result<Vec<Mesh>, MeshError> {
     Ok(parts)
 }
 
-/// Blocks at right angles, each at the end of the one before, and a boss.
+/// Blocks at right angles, each at the end of the previous one, and a boss.
 fn bracket(random: &mut impl Rng) -> Result<Vec<Mesh>, MeshError> {
     let broad = between(random, 0.15, 0.6);
     let thick = between(random, 0.1, 0.25);
@@ -176,7 +176,7 @@ fn bracket(random: &mut impl Rng) -> Result<Vec<Mesh>, MeshError> {
         let way = if random.random::<f64>() < 0.5 { -1.0 } else { 1.0 };
         let mut size = Vec3::repeat(thick);
         size[axis] = length + thick;
-        // Turned in a plane, the legs are all as broad; out of it, square.
+        // If all legs are in a plane, they have the same breadth; otherwise they are square.
         size.y = size.y.max(broad);
         let mut step = Vec3::zeros();
         step[axis] = way * length;
@@ -194,7 +194,7 @@ fn bracket(random: &mut impl Rng) -> Result<Vec<Mesh>, MeshError> {
     Ok(parts)
 }
 
-/// A grip with a head across its end and a tip or two.
+/// A grip with a head across its end and one or two tips.
 fn tool(random: &mut impl Rng) -> Result<Vec<Mesh>, MeshError> {
     let bend = if random.random::<f64>() < 0.4 { between(random, -0.8, 0.8) } else { 0.0 };
     let grip = solid(Kind::Bar, between(random, 0.06, 0.16), bend, random)?;
@@ -224,7 +224,7 @@ fn tool(random: &mut impl Rng) -> Result<Vec<Mesh>, MeshError> {
     Ok(parts)
 }
 
-/// Solids grown out of one another without a plan.
+/// Solids attached to each other at random.
 fn heap(random: &mut impl Rng) -> Result<Vec<Mesh>, MeshError> {
     let mut parts: Vec<Mesh> = vec![];
     for number in 0..random.random_range(3..=MOST) {
@@ -235,7 +235,7 @@ fn heap(random: &mut impl Rng) -> Result<Vec<Mesh>, MeshError> {
             parts.push(new);
             continue;
         }
-        // Mostly on the first ones, so that not all of them become chains.
+        // Mostly to the first ones, so that not all heaps become chains.
         let parent = random.random_range(0..parts.len()).min(random.random_range(0..parts.len()));
         let direction = random_rotation(random) * Vec3::z();
         let new = new.scaled(between(random, 0.3, 0.9));
@@ -244,7 +244,7 @@ fn heap(random: &mut impl Rng) -> Result<Vec<Mesh>, MeshError> {
     Ok(parts)
 }
 
-/// What a solid looks like.
+/// The kind of a solid.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Kind {
     Ellipsoid,
@@ -260,7 +260,7 @@ impl Kind {
         [Kind::Ellipsoid, Kind::Superquadric, Kind::Bar, Kind::Cone, Kind::Block, Kind::Turned];
 }
 
-/// A solid of length 1 along z from the origin, `width` its half width, bent by an angle (where it is a bar or a cone).
+/// A solid of length 1 along z from the origin, `width` its half width, bent by an angle (if it is a bar or a cone).
 fn solid(kind: Kind, width: f64, bend: f64, random: &mut impl Rng) -> Result<Mesh, MeshError> {
     let rows = random.random_range(14..=16usize);
     let sides = random.random_range(18..=22usize);
@@ -299,15 +299,15 @@ fn solid(kind: Kind, width: f64, bend: f64, random: &mut impl Rng) -> Result<Mes
     Sweep { profile, radii: (width, width * flat), section, bend }.mesh(sides)
 }
 
-/// A box of this size, its middle at `pose`.
+/// A box of this size, centred at `pose`.
 fn block(size: &Vec3, pose: &Pose) -> Result<Mesh, MeshError> {
     let mut builder = Builder::default();
     builder.cuboid(size, pose, 7);
     builder.finish(&Vec3::repeat(1.0))
 }
 
-/// Lets `part` (from the origin along z) grow out of `parent`'s surface in a direction from its middle, sunk in by a tenth
-/// to a third of its length; `centred` keeps it in the plane y = 0.
+/// Attaches `part` (from the origin along z) to `parent`'s surface in a direction from its centre, sunk in by a tenth to a
+/// third of its length; `centred` keeps it in the plane y = 0.
 fn attach(parent: &Mesh, direction: &Vec3, part: &Mesh, centred: bool, random: &mut impl Rng) -> Mesh {
     let (low, high) = parent.bounding_box();
     let middle = (low + high) * 0.5;
@@ -338,12 +338,12 @@ fn attach(parent: &Mesh, direction: &Vec3, part: &Mesh, centred: bool, random: &
     part.transformed(&Pose::new(towards(&axis) * roll, place - axis * sink))
 }
 
-/// A place in the plane y = 0 and a rotation that keeps it there, from z towards x.
+/// The pose with a position in the plane y = 0 and a rotation within this plane, from z towards x.
 fn in_plane(place: Vec3, angle: f64) -> Pose {
     Pose::new(UnitQuaternion::from_axis_angle(&Vector3::y_axis(), angle), place)
 }
 
-/// Mirrored at the plane y = 0, its faces still looking outwards.
+/// The mesh mirrored at the plane y = 0, its faces still facing outwards.
 fn mirrored(mesh: &Mesh) -> Result<Mesh, MeshError> {
     let vertices = mesh.vertices().iter().map(|v| Vec3::new(v.x, -v.y, v.z)).collect();
     Mesh::new(vertices, mesh.faces().iter().map(|[a, b, c]| [*a, *c, *b]).collect())
@@ -359,7 +359,7 @@ fn towards(axis: &Vec3) -> UnitQuaternion<f64> {
         .unwrap_or_else(|| UnitQuaternion::from_axis_angle(&Vector3::x_axis(), PI))
 }
 
-/// A rotation, each as likely as any other.
+/// A uniformly distributed rotation.
 fn random_rotation(random: &mut impl Rng) -> UnitQuaternion<f64> {
     let (z, angle) = (between(random, -1.0, 1.0), between(random, 0.0, TAU));
     let r = (1.0 - z * z).max(0.0).sqrt();
@@ -367,7 +367,7 @@ fn random_rotation(random: &mut impl Rng) -> UnitQuaternion<f64> {
     towards(&Vec3::new(r * angle.cos(), r * angle.sin(), z)) * roll
 }
 
-/// Machine parts lie on any of their sides.
+/// A rotation that puts a machine part on any of its sides.
 fn quarter_turns(random: &mut impl Rng) -> UnitQuaternion<f64> {
     let mut quarter = || f64::from(random.random_range(0..4u32)) * FRAC_PI_2;
     UnitQuaternion::from_axis_angle(&Vector3::x_axis(), quarter())
@@ -400,7 +400,7 @@ mod tests {
             let faces = mesh.faces().len();
             assert!((1500..=6000).contains(&faces), "{seed} {faces}");
         }
-        // The whole range, and from flat to round.
+        // Covers the whole range, and shapes from flat to round.
         assert!(smallest < 0.08 && largest > 0.27, "{smallest} {largest}");
         flatness.sort_by(f64::total_cmp);
         assert!(flatness[20] < 0.35 && flatness[180] > 0.6, "{flatness:?}");

@@ -1,6 +1,6 @@
 //! BOP datasets, result files, scores, detections.
 //!
-//! The examples read the three frames of LM-O that the repository holds in `data/demo`.
+//! The examples read the three frames of LM-O in the repository's folder `data/demo`.
 //!
 //! # Read a dataset
 //!
@@ -22,7 +22,7 @@
 //!
 //! # Score a result file
 //!
-//! The ground truth as estimates: every score is 1.
+//! With the ground truth as estimates, every score is 1.
 //!
 //! ```
 //! use sixfold::bop::{evaluate, read_results, write_results};
@@ -53,7 +53,7 @@
 //!
 //! # Run a method on a dataset
 //!
-//! Any method, into a result file, image by image. A run that was stopped resumes.
+//! Runs any method and writes a result file, image by image. A stopped run can be resumed.
 //!
 //! ```
 //! use std::sync::atomic::AtomicBool;
@@ -103,7 +103,7 @@
 //!
 //! # Detections
 //!
-//! Boxes and masks as COCO JSON; a dataset run takes them as regions.
+//! Boxes and masks as COCO JSON; a dataset run can use them as regions.
 //!
 //! ```
 //! use sixfold::bop::{Detection, ReadDetections, Rle, read_detections, write_detections};

@@ -1,4 +1,4 @@
-//! Poses from depth, verification, a method of your own.
+//! Poses from depth, verification, your own method.
 //!
 //! # A pose from depth, without training
 //!
@@ -33,7 +33,7 @@
 //!
 //! # Search in a region only
 //!
-//! A box that somebody drew, a detector's, or a mask.
+//! The region can be a box from a person or a detector, or a mask.
 //!
 //! ```
 //! use sixfold::align::DepthOptions;
@@ -89,7 +89,7 @@
 //!
 //! # A method of your own
 //!
-//! Two functions. `examples/own_method.rs` runs one through a dataset and scores it.
+//! It needs two main functions. `examples/own_method.rs` runs one on a dataset and scores it.
 //!
 //! ```
 //! use sixfold::estimator::{EstimatorError, Need, Needs};

@@ -1,8 +1,9 @@
-//! Meshes, images, camera files, objects under names.
+//! Meshes, images, camera files, named objects.
 //!
 //! # Read and write a mesh
 //!
-//! Mesh files do not say their unit, so readers ask for it and refuse sizes that no tabletop object has.
+//! Mesh files do not state their unit, so readers take it as an argument and refuse sizes that no tabletop
+//! object has.
 //!
 //! ```
 //! use sixfold::mesh::{PlyFormat, read_mesh, simplify, write_ply};
@@ -42,7 +43,7 @@
 //!
 //! # Objects under names
 //!
-//! What a method derives from an object is kept with the object.
+//! Data that a method derives from an object is stored with the object.
 //!
 //! ```
 //! use sixfold::estimator::{NewObject, ObjectRecord};
@@ -65,7 +66,7 @@
 //!
 //! # The cache
 //!
-//! What is derived from a mesh file, which has no folder in a store, goes to a bounded cache, or nowhere.
+//! A mesh file has no folder in a store, so its derived data is stored in a bounded cache, or not at all.
 //!
 //! ```
 //! use sixfold::mesh::ModelInfo;

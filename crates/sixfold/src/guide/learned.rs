@@ -1,10 +1,10 @@
 //! Pix2Pose, the detector, template matching, views by NOL.
 //!
-//! Weight files of Pix2Pose and the detector are made by `sixfold train`; the repository's `weights/` holds those for LM-O.
+//! `sixfold train` makes the weight files of Pix2Pose and the detector; the repository's `weights/` contains those for LM-O.
 //!
 //! # Template matching: objects never trained on
 //!
-//! Templates are cut out of depth images here; [`from_mesh`](crate::mttm::ObjectTemplates::from_mesh) renders them.
+//! Templates are cropped from depth images here; [`from_mesh`](crate::mttm::ObjectTemplates::from_mesh) renders them.
 //!
 //! ```
 //! use sixfold::mttm::{DepthView, ObjectTemplates, TemplateOptions};

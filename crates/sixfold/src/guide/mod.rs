@@ -1,8 +1,8 @@
 //! One example for each main task. All of them are tests; those that need no weight file run in seconds.
 //!
 //! - [`geometry`]: poses, rendering, PnP, ICP, simulated depth cameras.
-//! - [`files`]: meshes, images, camera files, objects under names.
-//! - [`estimation`]: poses from depth, verification, a method of your own.
+//! - [`files`]: meshes, images, camera files, named objects.
+//! - [`estimation`]: poses from depth, verification, your own method.
 //! - [`datasets`]: BOP datasets, result files, scores, detections.
 //! - `learned` (feature `networks`): Pix2Pose, the detector, template matching, views by NOL.
 //! - `grasps` (features `grasp` and `experience`): grasps from depth, trials in a physics engine, the store of experiences.

@@ -1,8 +1,8 @@
 //! Python's pickles as data: dictionaries with text, numbers and numpy arrays, as HO3D's `meta/*.pkl` are.
 //!
-//! A pickle is a program that may call any function of Python. Here nothing is called: names of functions stay names, and of these
-//! only numpy's constructors of arrays, types and scalars mean something; what others would have made is opaque. Every step of the
-//! program makes at most one value, values are shared and never copied: a file takes memory in proportion to its length.
+//! A pickle is a program that may call any function of Python. Here nothing is called: names of functions stay names. Only numpy's
+//! constructors of arrays, types and scalars are interpreted; the result of any other function is an opaque value. Every step of
+//! the program makes at most one value, values are shared and never copied: a file takes memory in proportion to its length.
 //! Opcodes: CPython's `Lib/pickletools.py`, protocols 0 to 5; numpy's part: `ndarray.__reduce__` and `numpy.dtype.__reduce__`.
 
 mod steps;
@@ -12,7 +12,7 @@ use std::collections::BTreeMap;
 
 use super::numpy::{Array, ElementType};
 
-/// What is wrong with a pickle, and where.
+/// Why a pickle cannot be read, and where.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct PickleError {
     /// Byte of the file.
@@ -23,12 +23,12 @@ pub(super) struct PickleError {
 
 type Result<T> = std::result::Result<T, PickleError>;
 
-/// How often a pickle may copy its own length: arrays are made of its bytes, mostly once.
+/// Limit on copied bytes, as a multiple of the pickle's length: arrays are copied from its bytes, usually once.
 const COPIES: usize = 4;
-/// Most dimensions of an array: numpy's limit.
+/// Maximum number of dimensions of an array: numpy's limit.
 const MAX_DIMENSIONS: usize = 64;
 
-/// A value's place among all that the pickle made.
+/// A value's index among all values that the pickle made.
 type Id = usize;
 
 #[derive(Debug, Clone)]
@@ -45,7 +45,7 @@ enum Node {
     EmptyArray,
     Type(ElementType),
     Array(Array),
-    /// What an unknown function would have made.
+    /// The result of an unknown function.
     Opaque,
 }
 
@@ -129,7 +129,7 @@ struct Machine<'a> {
     bytes: &'a [u8],
     /// The next byte.
     at: usize,
-    /// Where the current opcode stands.
+    /// Position of the current opcode.
     op: usize,
     nodes: Vec<Node>,
     stack: Vec<Id>,
@@ -143,7 +143,7 @@ impl Machine<'_> {
         Err(PickleError { at: self.op, found: found.into(), expected })
     }
 
-    /// Pays for a copy: the same bytes can be named again and again.
+    /// Subtracts a copy from the budget: a pickle can refer to the same bytes any number of times.
     fn pay(&self, bytes: usize) -> Result<()> {
         match self.budget.get().checked_sub(bytes) {
             Some(left) => self.budget.set(left),
@@ -197,7 +197,7 @@ impl Machine<'_> {
         }
     }
 
-    /// The values above the last mark, which goes too.
+    /// Removes and returns the values above the last mark, and removes the mark.
     fn above_mark(&mut self) -> Result<Vec<Id>> {
         let Some(mark) = self.stack.iter().rposition(|id| matches!(self.nodes[*id], Node::Mark)) else {
             return self.wrong("no mark", "a mark before these values");
@@ -270,7 +270,7 @@ impl Machine<'_> {
         }
     }
 
-    /// Steps until the value is complete.
+    /// Runs opcodes until the value is complete.
     fn run(&mut self) -> Result<Id> {
         loop {
             self.op = self.at;
@@ -301,7 +301,7 @@ impl Machine<'_> {
         }
     }
 
-    /// What a known function would have made.
+    /// The result of a known function.
     fn made(&self, function: Id, arguments: Id) -> Result<Node> {
         let Node::Name(name) = &self.nodes[function] else { return Ok(Node::Opaque) };
         self.pay(name.len())?;
@@ -356,7 +356,7 @@ impl Machine<'_> {
         }
     }
 
-    /// What `__setstate__` would do for arrays and types.
+    /// Applies a state to arrays and types, as `__setstate__` would.
     fn build(&mut self, object: Id, state: Id) -> Result<()> {
         // Version, shape, type, order and content of an array; version and byte order of a type.
         let items: Vec<Id> = self.items(state).iter().take(5).copied().collect();

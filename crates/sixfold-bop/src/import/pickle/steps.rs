@@ -1,4 +1,4 @@
-//! What each opcode of a pickle does.
+//! The opcodes of a pickle.
 
 use super::{Id, Machine, Node, Result};
 

@@ -1,4 +1,4 @@
-//! `sixfold demo`: the whole way on the sample frames, from files to scored poses and images.
+//! `sixfold demo`: all steps on the sample frames, from files to scored poses and images.
 
 use std::path::PathBuf;
 
@@ -65,7 +65,7 @@ fn print_tables(demo: &Demo) {
     }
 }
 
-/// Errors of poses from colour beside those from depth.
+/// Prints errors of poses from colour beside those from depth.
 fn print_colour(demo: &Demo) {
     let colour = &demo.colour;
     if let Some(reason) = &colour.reason {

@@ -1,4 +1,4 @@
-//! Arguments of `sixfold estimate`: what all methods share here, and the options of the chosen one (`methods.rs`).
+//! Arguments of `sixfold estimate`: the options that all methods share, and those of the chosen method (`methods.rs`).
 
 use std::num::NonZeroUsize;
 use std::path::PathBuf;
@@ -60,8 +60,8 @@ impl CacheArguments {
     }
 }
 
-/// What stands for one image in place of a dataset. Options of a dataset name it: what they require is not asked for by `clap`
-/// where something stands that it conflicts with, and they would be ignored.
+/// The options of a single image. Options of a dataset conflict with them explicitly: `clap` does not check a required option that
+/// conflicts with a given one, so options of a dataset would otherwise be ignored.
 const OF_ONE_IMAGE: [&str; 6] = ["depth", "camera", "objects", "object_id", "mask", "region"];
 
 /// Options that belong to no method.
@@ -151,7 +151,7 @@ pub(crate) struct CommonArguments {
     pub json: JsonArguments,
 }
 
-/// A number that can be the lowest confidence.
+/// A number that can be a minimum confidence.
 fn min_score(text: &str) -> Result<f64, String> {
     let value: f64 = text.parse().map_err(|error| format!("{error}"))?;
     check_min_confidence(value).map(|()| value).map_err(|error| format!("expected {}", error.expected))
@@ -165,7 +165,7 @@ pub(crate) struct EstimateArguments {
     matches: ArgMatches,
 }
 
-/// Options that say where results go, not what they are.
+/// Options about where results are written, which do not influence the results.
 const NOT_OF_RESULTS: [&str; 7] = ["out", "overlays", "json", "store", "cache", "no_cache", "object_id"];
 
 impl EstimateArguments {
@@ -174,7 +174,7 @@ impl EstimateArguments {
         &self.matches
     }
 
-    /// All options that decide about the results, by name.
+    /// All options on which the results depend, by name.
     pub fn run_options(&self) -> RunOptions {
         let mut options = RunOptions::default();
         let common = CommonArguments::augment_args(Command::new("common"));

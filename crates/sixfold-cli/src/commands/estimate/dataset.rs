@@ -1,4 +1,5 @@
-//! `sixfold estimate --dataset`: all targets of a BOP dataset into a result CSV, image by image, resumable.
+//! `sixfold estimate --dataset`: estimates all targets of a BOP dataset and writes a result CSV, image by image,
+//! resumable.
 
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -23,7 +24,7 @@ pub(super) fn run(a: &EstimateArguments, root: &Path) -> Result<Outcome> {
     if out.extension().is_none_or(|e| e != "csv") {
         bail!("--out: found {}, expected a file that ends in .csv", out.display());
     }
-    // The files that they name are hashed before they are read: what changes in between is never taken for the same.
+    // The files that they name are hashed before they are read, so that a change in between is noticed.
     let options = a.run_options();
     let dataset = datasets::open(root, &common.split, common.models.as_deref())?;
     let mut targets = datasets::targets(&dataset, common.targets.as_deref())?;
@@ -45,7 +46,7 @@ pub(super) fn run(a: &EstimateArguments, root: &Path) -> Result<Outcome> {
     };
     let mut overlays = common.overlays.as_deref().map(OutputFolder::take).transpose()?;
     let mut progress = Progress::new("images", images.len());
-    // An overlay that cannot be written costs no poses.
+    // If an overlay cannot be written, the poses are kept.
     let mut undrawn = vec![];
     let summary = run.run(out, interrupted(), &mut |event| {
         match event {
@@ -87,7 +88,7 @@ pub(super) fn run(a: &EstimateArguments, root: &Path) -> Result<Outcome> {
     })
 }
 
-/// Where the options say that the targets are, and what was left out of a file of detections.
+/// The regions of the targets according to the options, and what was left out of a file of detections.
 fn regions(
     a: &CommonArguments,
     dataset: &BopDataset,

@@ -27,11 +27,11 @@ struct Input {
 }
 
 impl Input {
-    /// Reads the files that the arguments name, and says what is missing.
+    /// Reads the files that the arguments name; an error states what is missing.
     fn read(a: &CommonArguments, estimator: &dyn PoseEstimator) -> Result<Input> {
         let (needs, method) = (estimator.needs(), estimator.name());
         if needs.depth == Need::Required && a.depth.is_none() {
-            // A method on colour needs depth for that alone.
+            // A colour method needs depth only for ICP.
             let with = if needs.rgb == Need::Required { " with --icp" } else { "" };
             bail!(
                 "--method {method}{with} works on depth: give --depth FILE (with --camera and --object) or --dataset DIR"
@@ -60,7 +60,7 @@ impl Input {
         };
         let raw_rgb =
             a.rgb.as_ref().map(|path| Ok::<_, anyhow::Error>((path, read_rgb(path)?))).transpose()?;
-        // The image that the method works on says which size the camera is for.
+        // The image that the method uses determines the size for the camera.
         let size = match (&raw_rgb, &raw_depth) {
             (Some((_, rgb)), _) if needs.rgb == Need::Required => rgb.size(),
             (_, Some((_, depth))) => depth.size(),
@@ -79,7 +79,7 @@ impl Input {
         Ok(Input { lens, camera: lens.without_distortion(), depth, rgb })
     }
 
-    /// The image as the method wants it.
+    /// The image, prepared for the method.
     fn prepared(
         &self,
         a: &CommonArguments,
@@ -109,7 +109,7 @@ pub(super) fn run(a: &EstimateArguments) -> Result<Outcome> {
         );
     }
     let input = Input::read(common, estimator)?;
-    // Before the poses take their time: what stands in the folder may be the input itself.
+    // Check the folder before the search, which takes time: it may contain the input itself.
     let mut folder = common.out.as_deref().map(OutputFolder::take).transpose()?;
     folder.as_mut().map(|f| f.files(&["poses.json", "overlay.png"])).transpose()?;
     let depth = input.prepared(common, estimator)?;
@@ -130,7 +130,7 @@ pub(super) fn run(a: &EstimateArguments) -> Result<Outcome> {
         depth: depth.as_ref(),
         region,
         max_instances: common.instances.get(),
-        // A person who asks about one image wants no guesses.
+        // For one image, a person wants no guesses.
         min_confidence: common.min_score.unwrap_or(estimator.min_confidence().image),
         diagnostics: common.out.is_some(),
         ..Query::new(&input.camera)
@@ -168,7 +168,7 @@ fn search(a: &CommonArguments, image: &ImageRun<'_>, nowhere: bool) -> Result<Ve
                 Object { id: a.object_id, ..object }
             }
         };
-        // Of a mesh file the messages name the file.
+        // For a mesh file, messages name the file.
         let named = || name.filter(|n| Path::new(n).is_file()).cloned().unwrap_or_default();
         let one = if nowhere {
             let object = image.estimator.prepare(&object).with_context(named)?;

@@ -1,5 +1,5 @@
-//! The methods of `sixfold estimate`: a name, options, and how they become an estimator. A new method is one struct of options
-//! and one line in [`METHODS`].
+//! The methods of `sixfold estimate`: a name, options, and the construction of an estimator from them. A new method is one
+//! struct of options and one line in [`METHODS`].
 
 use std::path::PathBuf;
 
@@ -14,15 +14,15 @@ use super::arguments::CommonArguments;
 use super::networks;
 use crate::commands::object::arguments::TemplateViews;
 
-/// What makes an estimator of options.
+/// Constructs an estimator from options.
 type Build = fn(&ArgMatches, &CommonArguments) -> Result<Box<dyn PoseEstimator>>;
 
-/// A method as the command line knows it.
+/// A method on the command line.
 #[derive(Debug)]
 pub(crate) struct Method {
-    /// As it is typed.
+    /// Its name on the command line.
     pub name: &'static str,
-    /// What it is, for `--help`.
+    /// Its description for `--help`.
     pub about: &'static str,
     options: fn(Command) -> Command,
     build: Build,
@@ -48,7 +48,7 @@ impl Method {
         self.arguments().iter().any(|a| a.get_id() == id)
     }
 
-    /// The estimator that these options ask for.
+    /// The estimator for these options.
     pub fn build(&self, matches: &ArgMatches, common: &CommonArguments) -> Result<Box<dyn PoseEstimator>> {
         (self.build)(matches, common)
     }
@@ -63,7 +63,7 @@ pub(super) struct PresetArguments {
 }
 
 impl PresetArguments {
-    /// Whether the published form was asked for.
+    /// Whether the published form was requested.
     pub fn published(&self) -> bool {
         matches!(self.preset, Some(Preset::Published))
     }
@@ -173,7 +173,7 @@ impl Matcher {
     }
 }
 
-/// How depth images are prepared by the options that methods on depth share.
+/// The preparation of depth images according to the options that depth methods share.
 pub(super) fn depth_options(keep_plane: bool, common: &CommonArguments) -> DepthOptions {
     DepthOptions { remove_plane: !keep_plane, seed: common.seed, ..DepthOptions::default() }
 }

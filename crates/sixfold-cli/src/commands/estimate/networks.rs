@@ -1,4 +1,4 @@
-//! What `sixfold estimate` does with networks: `--method pix2pose`, `--detector`, and the network of `--method mttm`.
+//! The parts of `sixfold estimate` that need networks: `--method pix2pose`, `--detector`, and the network of `--method mttm`.
 
 use std::collections::BTreeSet;
 use std::num::NonZeroUsize;
@@ -23,7 +23,7 @@ use sixfold_views::estimator::ViewsEstimator;
 use super::arguments::CommonArguments;
 use super::methods::{Method, MethodArguments, PresetArguments, depth_options};
 
-/// Who matches with `--method mttm`, unless `--matcher` says so.
+/// The default of `--matcher` for `--method mttm`.
 pub(super) const DEFAULT_MATCHER: &str = "both";
 
 /// Poses from colour.
@@ -38,7 +38,7 @@ pub(super) const VIEWS: Method = Method::of::<ViewsArguments>(
     "rendered views of a mesh matched with a colour image, in boxes or in those of a detector for any object, no training",
 );
 
-/// All methods, judged together.
+/// All methods together, with probabilities.
 pub(super) const AUTO: Method = Method::of::<AutoArguments>(
     "auto",
     "all methods that the images allow, until an object is found with a high probability; each pose with its probability",
@@ -141,26 +141,26 @@ impl MethodArguments for Pix2PoseArguments {
     }
 }
 
-/// The file beside a detector's weights that says which objects its labels are, if there is one.
+/// The file beside a detector's weights that maps its labels to objects, if there is one.
 pub(super) fn objects_file(weights: &Path) -> Option<PathBuf> {
     existing_objects_file(weights)
 }
 
-/// Where a detector sees the object best, if at all.
+/// The most confident region of the object by a detector, if there is one.
 pub(super) fn detected(weights: &Path, image: &RgbImage, id: u32) -> Result<Option<Region>> {
     let detector = TrainedDetector::load(weights)?;
     detector.check_object(id).with_context(|| weights.display().to_string())?;
     Ok(detector.best(image, id)?)
 }
 
-/// Where a detector sees the objects `ids` in a dataset.
+/// The regions of the objects `ids` in a dataset by a detector.
 pub(super) fn regions(weights: &Path, ids: BTreeSet<u32>) -> Result<RegionSource> {
     let detector = TrainedDetector::load(weights)?.for_dataset();
     let of_detector = RegionSource::of_detector(Box::new(detector), ids);
     of_detector.with_context(|| weights.display().to_string())
 }
 
-/// The same with a network, where one matches: that in `weights`, or that within the program.
+/// The estimator with a network, if its matcher needs one: from `weights`, or the built-in one.
 pub(super) fn with_network(estimator: MttmEstimator, weights: Option<&Path>) -> Result<MttmEstimator> {
     let network = match (estimator.options.matched_by, weights) {
         (MatchedBy::Points, _) => None,

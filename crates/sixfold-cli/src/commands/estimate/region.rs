@@ -1,4 +1,4 @@
-//! Where in one image to look: `--box`, `--mask` or what `--detector` finds, in the pinhole image.
+//! The region to search in one image, from `--box`, `--mask` or `--detector`, in the pinhole image.
 
 use std::path::Path;
 
@@ -10,17 +10,18 @@ use sixfold_io::read_mask;
 use super::arguments::CommonArguments;
 use super::networks;
 
-/// Where to look.
+/// The region to search.
 pub(super) enum Where {
     /// In the whole image.
     Anywhere,
     /// In a region.
     In(Region),
-    /// Nowhere: the detector does not see the object.
+    /// Nowhere: the detector did not find the object.
     Nowhere,
 }
 
-/// What the options say. `lens` is the camera with its distortion, `image` the colour image without.
+/// The region from the options. `lens` is the camera with its distortion, `image` the colour image without
+/// it.
 pub(super) fn find(a: &CommonArguments, lens: &Camera, image: Option<&RgbImage>) -> Result<Where> {
     let boxed = given_box(a, lens)?.map(|b| undistort_box(&b, lens));
     if let Some(weights) = &a.detector {
@@ -41,7 +42,7 @@ pub(super) fn find(a: &CommonArguments, lens: &Camera, image: Option<&RgbImage>)
     })
 }
 
-/// `--box`, which has a size and shows something of the image.
+/// `--box`, checked to have a size and to overlap the image.
 fn given_box(a: &CommonArguments, camera: &Camera) -> Result<Option<Rect>> {
     let Some(r) = &a.region else { return Ok(None) };
     let [x, y, width, height] = r[..] else {
@@ -58,7 +59,7 @@ fn given_box(a: &CommonArguments, camera: &Camera) -> Result<Option<Rect>> {
     Ok(Some(region))
 }
 
-/// The pixels of `--mask`, of those of `--box` where that is given too.
+/// The pixels of `--mask`, within `--box` if that is given too.
 fn given_mask(path: &Path, lens: &Camera, boxed: Option<&Rect>) -> Result<Region> {
     let mask = read_mask(path)?;
     lens.check_image(mask.width(), mask.height()).with_context(|| path.display().to_string())?;
@@ -80,6 +81,6 @@ fn given_mask(path: &Path, lens: &Camera, boxed: Option<&Rect>) -> Result<Region
     if lens.distortion.is_none() {
         return Ok(region);
     }
-    // Of a distorted image it fits no pixel of the pinhole image exactly: its box has to do.
+    // A mask of a distorted image does not match the pixels of the pinhole image: use its box.
     Ok(Region::of_box(undistort_box(&region.bbox, lens)))
 }

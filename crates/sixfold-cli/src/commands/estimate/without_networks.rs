@@ -1,4 +1,4 @@
-//! In the place of `networks.rs` when the feature `networks` is off: what needs a network is refused.
+//! Replaces `networks.rs` when the feature `networks` is off: options that need a network are refused.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -10,7 +10,7 @@ use sixfold_mttm::{MatchedBy, MttmEstimator};
 use sixfold_runner::RegionSource;
 use sixfold_shell::WITHOUT_NETWORKS;
 
-/// Who matches with `--method mttm`, unless `--matcher` says so.
+/// The default of `--matcher` for `--method mttm`.
 pub(super) const DEFAULT_MATCHER: &str = "points";
 
 pub(super) fn objects_file(_weights: &Path) -> Option<PathBuf> {
@@ -25,7 +25,7 @@ pub(super) fn regions(_weights: &Path, _ids: BTreeSet<u32>) -> Result<RegionSour
     bail!("--detector: {WITHOUT_NETWORKS}")
 }
 
-/// The same, when points match alone.
+/// The same estimator, if it matches by points only.
 pub(super) fn with_network(estimator: MttmEstimator, weights: Option<&Path>) -> Result<MttmEstimator> {
     match (estimator.options.matched_by, weights) {
         (_, Some(_)) => bail!("--weights: {WITHOUT_NETWORKS}"),

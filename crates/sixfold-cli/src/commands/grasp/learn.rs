@@ -1,4 +1,4 @@
-//! `sixfold grasp learn`: a simulated hand tries grasps, and what works becomes experience.
+//! `sixfold grasp learn`: a simulated hand tries grasps, and successful grasps become experience.
 
 use anyhow::Result;
 use sixfold_shell::Outcome;

@@ -158,7 +158,7 @@ fn method(_: &ProposeArguments, planner: &Planner) -> String {
     planner.name().to_owned()
 }
 
-/// Outcomes rank grasps by the quality of their contacts, which the planners that learn do not compute.
+/// The ranking by outcomes uses the quality of contacts, which trained planners do not compute.
 #[cfg(feature = "experience")]
 fn check_combination(a: &ProposeArguments, planner: &Planner) -> Result<()> {
     let learned = !matches!(planner, Planner::Antipodal);
@@ -171,7 +171,8 @@ fn check_combination(a: &ProposeArguments, planner: &Planner) -> Result<()> {
     Ok(())
 }
 
-/// Grasps of both kinds, ranked together; with a part's name, those that hold what experience on it held.
+/// Grasps from geometry and from experience, ranked together; with a part's name, only those on the part according to
+/// experience on it.
 #[cfg(feature = "experience")]
 fn with_experience(
     a: &ProposeArguments,

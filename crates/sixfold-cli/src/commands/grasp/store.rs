@@ -252,7 +252,7 @@ fn forget(file: &StorePlace, ids: &[i64], attempts: &[i64], json: &JsonArguments
     Ok(if nothing { Outcome::NothingFound } else { Outcome::Found })
 }
 
-/// `found`: whether the command has done what it is for.
+/// `found`: whether the command did its task.
 fn outcome_of(moved: &Moved, found: bool) -> Outcome {
     match (moved.unreadable, found) {
         (1.., _) => Outcome::Incomplete,

@@ -34,7 +34,7 @@ struct Listed {
 struct Added<'a> {
     #[serde(flatten)]
     listed: &'a Listed,
-    /// What its masks held besides, one for each; empty with --mask-as-is.
+    /// The parts removed from its masks, one entry per mask; empty with --mask-as-is.
     left_out: Vec<LeftOut>,
 }
 
@@ -95,7 +95,7 @@ fn add_views(store: &ObjectStore, a: &AddArguments, json: &JsonArguments) -> Res
     Ok(Outcome::Found)
 }
 
-/// Stores a mesh, and what methods derive from it: now, not at the first estimate.
+/// Stores a mesh and its derived data, which are computed now rather than at the first estimate.
 fn add_mesh(store: &ObjectStore, a: &AddArguments, mesh: &Path, json: &JsonArguments) -> Result<Outcome> {
     let unit = a.unit.as_ref().ok_or_else(|| anyhow!("--unit UNIT is missing"))?;
     let loaded = read_mesh(mesh, *unit)?;

@@ -56,7 +56,8 @@ fn find(mesh: &Mesh, noise: f64) -> Result<Vec<FoundSymmetry>> {
         .with_context(|| format!("--noise: found {noise} mm"))
 }
 
-/// Gives `info` the sure symmetries of a mesh, where `add --find-symmetries` asks for them; what it stores and what not, in words.
+/// Adds the sure symmetries of a mesh to `info` if `add --find-symmetries` requests them; returns a description of what is stored
+/// and what is not.
 pub(crate) fn add_to(info: &mut ModelInfo, mesh: &Mesh, a: &AddArguments) -> Result<Vec<String>> {
     let Some(evidence) = a.find_symmetries else { return Ok(vec![]) };
     if info.is_symmetric() {

@@ -1,4 +1,4 @@
-//! Arguments of `sixfold simulate-scenes`, and whether it makes sense.
+//! Arguments of `sixfold simulate-scenes`, and their checks.
 
 use std::path::{Path, PathBuf};
 
@@ -16,7 +16,7 @@ use sixfold_shell::output::JsonArguments;
 use sixfold_shell::ranges::{folder_name, in_range, without_duplicates};
 use sixfold_shell::scenes::NamedModels;
 
-/// Most synthetic objects of a kind: each is kept in memory with its mesh.
+/// Maximum number of synthetic objects of a kind: each is kept in memory with its mesh.
 const MOST_OBJECTS: usize = 10_000;
 
 /// Shown under `sixfold simulate-scenes --help`.
@@ -106,7 +106,7 @@ pub(crate) struct SimulateScenesArguments {
 }
 
 impl SimulateScenesArguments {
-    /// Tests every option that is a number or a name.
+    /// Checks every option that is a number or a name.
     pub fn check(&self) -> Result<()> {
         if self.objects.is_empty() && self.dataset.is_none() && self.families.is_empty() && self.toys == 0 {
             bail!(
@@ -180,7 +180,7 @@ impl SimulateScenesArguments {
         Ok(models)
     }
 
-    /// What the inputs hold. Synthetic objects follow from the options.
+    /// Hashes of the inputs. Synthetic objects follow from the options.
     pub fn contents(&self, models: &NamedModels) -> Result<Contents> {
         let mut contents = Contents::default();
         if let Some(camera) = &self.camera {
@@ -193,7 +193,7 @@ impl SimulateScenesArguments {
         Ok(contents)
     }
 
-    /// What scenes are like.
+    /// The options of the scenes.
     pub fn tabletop(&self) -> TabletopOptions {
         TabletopOptions {
             objects: [self.objects_per_scene[0], self.objects_per_scene[1]],
@@ -219,7 +219,7 @@ impl SimulateScenesArguments {
             .collect()
     }
 
-    /// The options that decide about the result.
+    /// The options on which the result depends.
     pub fn deciding(&self) -> Value {
         let path = |path: &Path| path.display().to_string();
         json!({

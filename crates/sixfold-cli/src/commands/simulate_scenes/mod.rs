@@ -29,9 +29,9 @@ struct Summary {
     instances: usize,
     /// The mean of their visible fractions.
     mean_visible: f64,
-    /// Scenes made now (the others were there) and how long they took, without the time to prepare the objects.
+    /// Scenes made in this run (the others existed already) and the time they took, without the preparation of the objects.
     new_scenes: usize,
-    /// Objects that were dropped in them, and those of them that came to rest within reach.
+    /// Objects that were dropped in them, and those that came to rest within reach.
     dropped: usize,
     resting: usize,
     seconds: f64,
@@ -41,7 +41,7 @@ struct Summary {
 pub(crate) fn run(a: &SimulateScenesArguments) -> Result<Outcome> {
     a.check()?;
     let camera = pinhole(a.camera.as_deref())?;
-    // Other options are refused before the objects take their time.
+    // Other options are refused before the slow preparation of the objects.
     let inputs: Vec<&Path> = [&a.dataset, &a.camera].into_iter().flatten().map(|p| p.as_path()).collect();
     let folder = DatasetFolder::take(&a.out, "simulate-scenes", a.deciding(), &inputs)?;
     let models = a.models()?;

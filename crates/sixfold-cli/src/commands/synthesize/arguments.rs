@@ -167,7 +167,7 @@ pub(crate) const AFTER_HELP: &str = "Examples:\n  \
     After a stop, the same command resumes.";
 
 impl SynthesizeArguments {
-    /// Tests every option that is a number.
+    /// Checks every option that is a number.
     pub fn check(&self) -> Result<()> {
         for (option, values) in
             [("--elevation", &self.elevation), ("--rough", &self.rough), ("--disturb", &self.disturb)]
@@ -206,7 +206,7 @@ impl SynthesizeArguments {
         Ok(())
     }
 
-    /// By how much poses are disturbed, metres and radians.
+    /// The largest disturbance of poses, metres and radians.
     pub fn disturb_reach(&self) -> Result<Option<[f64; 2]>> {
         match self.disturb.as_slice() {
             [] => Ok(None),
@@ -222,24 +222,24 @@ impl SynthesizeArguments {
         self.turns.unwrap_or(if self.preset.is_some() { 7 } else { 1 })
     }
 
-    /// By what photographs are chosen.
+    /// The criterion by which photographs are chosen.
     pub fn select(&self) -> SelectKind {
         self.select.unwrap_or(if self.preset.is_some() { SelectKind::Pose } else { SelectKind::Surface })
     }
 
-    /// How poses are made better, where they are.
+    /// The kind of pose refinement.
     pub fn refinement_kind(&self) -> RefinementKind {
         let default = if self.preset.is_some() { RefinementKind::Published } else { RefinementKind::Ours };
         self.refinement.unwrap_or(default)
     }
 
-    /// Where the views are taken from.
+    /// The viewpoints of the views.
     pub fn grid(&self) -> ViewGrid {
         let (step, elevation) = (self.step, [self.elevation[0], self.elevation[1]]);
         ViewGrid { step, elevation, turns: self.turns(), size: self.size, seed: self.seed }
     }
 
-    /// How poses are made better; none where they are taken as they are.
+    /// The options of pose refinement; `None` if poses are not refined.
     pub fn refinement(&self) -> Option<PoseRefinementOptions> {
         let scene = match self.scene {
             SceneArgument::Judge => SceneKind::Judge,
@@ -251,7 +251,7 @@ impl SynthesizeArguments {
         (!self.no_refine).then_some(options)
     }
 
-    /// Options that decide about the result; a folder made with others is not gone on with.
+    /// The options on which the result depends; a folder made with others is not resumed.
     pub fn deciding(&self) -> Value {
         json!({
             "version": env!("CARGO_PKG_VERSION"),

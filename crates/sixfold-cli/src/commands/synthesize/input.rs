@@ -1,4 +1,4 @@
-//! Photographs with rough poses: from a BOP dataset, or from a file that names them.
+//! Photographs with approximate poses: from a BOP dataset, or from a file that lists them.
 
 use std::collections::BTreeSet;
 
@@ -13,7 +13,7 @@ use sixfold_shell::folder::Contents;
 
 use super::arguments::SynthesizeArguments;
 
-/// All that is given.
+/// Reads the input.
 pub(super) fn read(a: &SynthesizeArguments) -> Result<RoughImages> {
     let detector = a.detector.as_deref().map(TrainedDetector::load).transpose()?;
     let detect = |image: &RgbImage| match &detector {
@@ -59,7 +59,7 @@ pub(super) fn read(a: &SynthesizeArguments) -> Result<RoughImages> {
     Ok(images)
 }
 
-/// What the inputs hold.
+/// Hashes of the inputs.
 pub(super) fn contents(a: &SynthesizeArguments, images: &RoughImages) -> Result<Contents> {
     let mut contents = Contents::default();
     let objects = a.detector.as_deref().and_then(existing_objects_file);

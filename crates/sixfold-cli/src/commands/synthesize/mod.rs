@@ -1,5 +1,5 @@
-//! `sixfold synthesize`: from a few cluttered photographs with rough poses to a training set of new views (Neural Object
-//! Learning; K. Park, dissertation, chapter 4).
+//! `sixfold synthesize`: makes a training set of new views from a few cluttered photographs with approximate poses (Neural
+//! Object Learning; K. Park, dissertation, chapter 4).
 
 pub(crate) mod arguments;
 mod input;
@@ -31,7 +31,7 @@ use sixfold_shell::pictures::Pictures;
 use sixfold_shell::progress::{Bar, Progress, interrupted};
 use sixfold_shell::sheets::write_sheet;
 
-/// Side of the crops that new views take their colours from, pixels.
+/// Side of the crops that provide the colours of new views, pixels.
 const CROP: usize = 256;
 
 #[derive(Serialize)]
@@ -56,7 +56,7 @@ struct ObjectSummary {
     pixels_differing: f64,
     /// Fraction of the surface that no photograph shows.
     surface_unseen: f64,
-    /// Fraction of the object's pixels in all views that no photograph shows; they are filled from what is near.
+    /// Fraction of the object's pixels in all views that no photograph shows; they are filled from their surroundings.
     pixels_unseen: f64,
     median_moved_mm: f64,
     median_turned_degrees: f64,
@@ -105,8 +105,8 @@ pub(crate) fn run(a: &SynthesizeArguments) -> Result<Outcome> {
     }
     progress.finish();
     sheets.did(write_sheet(&a.out.join("preview.png"), &rows));
-    // BOP has one such file a dataset, for tools that need any camera: that of the first image. Each image's own intrinsics are
-    // in scene_camera.json.
+    // BOP has one such file per dataset, for tools that need any camera: it holds that of the first image. Each image's own
+    // intrinsics are in scene_camera.json.
     if let Some(camera) = first_camera {
         write_camera(&a.out, &camera, 1e-3)?;
     }
@@ -125,7 +125,7 @@ pub(crate) fn run(a: &SynthesizeArguments) -> Result<Outcome> {
     Ok(sheets.outcome(if found { Outcome::Found } else { Outcome::NothingFound }))
 }
 
-/// Makes the poses better, draws them, and puts them in place of the given ones.
+/// Refines the poses, draws them, and replaces the given ones.
 fn refined_poses(
     a: &SynthesizeArguments,
     images: &mut RoughImages,
@@ -157,7 +157,7 @@ fn backgrounds(a: &SynthesizeArguments) -> Result<Backgrounds> {
     })
 }
 
-/// What new views are made with.
+/// The data for new views.
 struct Views<'a> {
     a: &'a SynthesizeArguments,
     backgrounds: Backgrounds,
@@ -165,7 +165,7 @@ struct Views<'a> {
 }
 
 impl Views<'_> {
-    /// Writes the views of one object; what is said of them, and what was written.
+    /// Writes the views of one object; returns their report and the written entries.
     fn of_object(
         &self,
         object: &RoughObject,

@@ -1,4 +1,4 @@
-//! `sixfold train detector`: photographs with their ground truth, and models, in; a detector's file out.
+//! `sixfold train detector`: trains a detector from photographs with ground truth and from models, and writes its file.
 
 use std::path::PathBuf;
 

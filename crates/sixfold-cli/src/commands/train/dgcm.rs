@@ -1,4 +1,4 @@
-//! `sixfold train dgcm`: nothing but a seed in, a network for grasps from experience out.
+//! `sixfold train dgcm`: trains a network for grasps from experience; the only input is a seed.
 
 use std::path::PathBuf;
 
@@ -84,7 +84,7 @@ impl TrainDgcmArguments {
     }
 }
 
-/// How much was learnt from.
+/// The amount of training data.
 #[derive(Serialize)]
 pub(super) struct Views {
     views: usize,

@@ -1,5 +1,5 @@
-//! `sixfold train`: data in, a model file out; interrupted at any time, it is resumed. One driver for the recipes of all
-//! methods, and what is shown of it.
+//! `sixfold train`: trains on data and writes a model file; an interrupted training can be resumed. One driver for the
+//! recipes of all methods, with its display.
 
 mod detector;
 #[cfg(feature = "experience")]
@@ -166,7 +166,7 @@ fn show<M: Serialize>(
     Ok(Outcome::Found)
 }
 
-/// A recipe whose options are in their ranges, before its data are read.
+/// Checks that a recipe's options are in their ranges, before its data are read.
 fn checked<R: Recipe>(recipe: R) -> Result<R> {
     recipe.check().map_err(|error| by_flag(&error))?;
     Ok(recipe)
@@ -183,7 +183,7 @@ fn train_in<R: Recipe>(
     training::train_in(recipe, data, out, export_only, shown, by_flag)
 }
 
-/// An option out of its range, by the flag that sets it where there is one.
+/// An option out of its range, named by its flag if there is one.
 fn by_flag(error: &OptionError) -> anyhow::Error {
     let flag = error.field.replace('_', "-");
     let command = Arguments::command();

@@ -1,5 +1,5 @@
-//! `sixfold train mttm`: synthetic objects fall on a table, depth cameras look at them, and a network learns to match regions
-//! with templates. Nothing but a seed goes in.
+//! `sixfold train mttm`: synthetic objects fall on a table, depth cameras view them, and a network learns to match regions
+//! with templates. The only input is a seed.
 
 use std::path::PathBuf;
 
@@ -79,7 +79,7 @@ impl TrainMttmArguments {
 /// Trains, or resumes a training, and writes the model.
 pub(super) fn train_mttm(a: &TrainMttmArguments) -> Result<Summary<Measured<Quality>>> {
     let recipe = checked(a.recipe())?;
-    // Scenes are made before the training and after it.
+    // Scenes are made before and after the training.
     let shown = Shown {
         preparing: "scenes",
         measuring: "test scenes",

@@ -1,4 +1,5 @@
-//! `sixfold train nol`: nothing but a seed in (better: photographs for textures too), a network that renders new views out.
+//! `sixfold train nol`: trains a network that renders new views; the inputs are a seed and, preferably, photographs for
+//! textures.
 
 use std::path::PathBuf;
 

@@ -1,4 +1,4 @@
-//! Options of trainings on the command line, from the recipes' own types and defaults.
+//! Options of trainings on the command line, based on the types and defaults of the recipes.
 
 use std::fmt;
 use std::path::PathBuf;
@@ -87,7 +87,7 @@ impl FromStr for Degrees {
 
 impl fmt::Display for Degrees {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        // As it would be typed: without the rounding errors of the conversion.
+        // In the form in which it would be typed, without the rounding errors of the conversion.
         write!(f, "{}", (f64::from(self.radians).to_degrees() * 1e4).round() / 1e4)
     }
 }

@@ -1,4 +1,4 @@
-//! `sixfold train pix2pose`: posed images and meshes in, a model file out.
+//! `sixfold train pix2pose`: trains on posed images and meshes, and writes a model file.
 
 use std::path::PathBuf;
 
@@ -20,7 +20,7 @@ fn default() -> Pix2PoseRecipe {
     Pix2PoseRecipe::default()
 }
 
-/// Of the compact network, and of the dissertation's.
+/// The defaults of the compact network and of the dissertation's.
 fn defaults() -> (Pix2PoseTrainingOptions, AdversarialOptions) {
     (default().compact_options(), default().dissertation_options())
 }

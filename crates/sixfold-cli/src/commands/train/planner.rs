@@ -1,5 +1,5 @@
 //! `sixfold train planner`: grasps on synthetic objects are tried in a physics engine, and a planner learns which of them hold.
-//! Nothing but a seed goes in.
+//! The only input is a seed.
 
 use std::path::PathBuf;
 

@@ -1,4 +1,5 @@
-//! `sixfold train proposals`: nothing but a seed in (better: photographs for textures too), a detector of any object out.
+//! `sixfold train proposals`: trains a detector of any object; the inputs are a seed and, preferably, photographs for
+//! textures.
 
 use std::path::PathBuf;
 

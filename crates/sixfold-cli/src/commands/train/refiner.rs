@@ -1,4 +1,5 @@
-//! `sixfold train refiner`: nothing but a seed in (better: photographs for textures too), a network that refines poses out.
+//! `sixfold train refiner`: trains a network that refines poses; the inputs are a seed and, preferably, photographs for
+//! textures.
 
 use std::path::PathBuf;
 

@@ -1,4 +1,4 @@
-//! The defaults of trainings stand once, in the recipes: the command line asks for those.
+//! The defaults of trainings are defined once, in the recipes; the command line uses them.
 
 use std::fmt::Debug;
 
@@ -18,7 +18,7 @@ use sixfold_views::refiner::recipe::RefinerRecipe;
 
 use super::*;
 
-/// What the command line asks for without options.
+/// The training for a command line without options.
 fn parsed(words: &str) -> TrainCommand {
     let words = format!("sixfold train {words} --out out");
     match Arguments::try_parse_from(words.split(' ')).unwrap().command {
@@ -72,7 +72,7 @@ fn the_preset_published_asks_for_the_published_recipes_and_other_options_still_c
             $recipe { command: command_line(), ..$recipe::published() }
         };
     }
-    // The older name is understood too.
+    // The older name is accepted too.
     for name in ["published", "paper"] {
         let words = |training: &str| format!("{training} --preset {name}");
         same(recipe!(Pix2pose, &words("pix2pose --object mug.ply")), published!(Pix2PoseRecipe));

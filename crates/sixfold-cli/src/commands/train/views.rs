@@ -1,4 +1,5 @@
-//! `sixfold train views`: nothing but a seed in (better: photographs for textures too), a network that matches rendered views out.
+//! `sixfold train views`: trains a network that matches rendered views; the inputs are a seed and, preferably, photographs for
+//! textures.
 
 use std::path::PathBuf;
 

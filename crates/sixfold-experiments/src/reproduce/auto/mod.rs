@@ -1,7 +1,7 @@
-//! `sixfold reproduce auto`: objects that are in images and objects that are not, searched by all methods; whether the probabilities
-//! hold, with depth, with colour and with both; and the fit of these probabilities.
+//! `sixfold reproduce auto`: all methods search for objects that are in images and objects that are not, with depth, with colour
+//! and with both. Measures how accurate the probabilities are, or fits them.
 //!
-//! Every image's answers are kept in `rows/`, so an interrupted run continues where it was.
+//! The results of every image are stored in `rows/`, so that an interrupted run can be resumed.
 
 mod picture;
 mod table;
@@ -102,7 +102,7 @@ impl Given {
     }
 }
 
-/// Objects of which less is seen are not asked for, as BOP does.
+/// Minimum visible fraction of an object that is searched, as in BOP.
 const MIN_VISIBLE: f64 = 0.1;
 /// A pose is right within this fraction of the diameter (MSSD).
 const RIGHT: f64 = 0.1;
@@ -116,12 +116,12 @@ struct Search {
     given: Given,
     /// Whether the image shows it.
     present: bool,
-    /// All poses that came up, the most probable first.
+    /// All poses found, the most probable first.
     poses: Vec<FoundPose>,
     seconds: f64,
 }
 
-/// A pose that came up.
+/// A pose that was found.
 #[derive(Debug, Serialize, Deserialize)]
 struct FoundPose {
     method: String,
@@ -145,7 +145,7 @@ struct Inputs {
     seed: u64,
 }
 
-/// A dataset's object, ready to be searched and scored.
+/// A dataset's object, prepared for search and scoring.
 struct Known {
     prepared: Box<dyn sixfold_estimator::PreparedObject>,
     points: ModelPoints,
@@ -305,7 +305,7 @@ fn visible(image: &SceneImage) -> BTreeSet<u32> {
     image.ground_truth.iter().zip(fractions).filter(seen).map(|(g, _)| g.obj_id).collect()
 }
 
-/// Searches objects in one image; those with a number are there.
+/// Searches objects in one image; those with a number are in it.
 fn search<'k>(
     auto: &AutoEstimator,
     given: Given,

@@ -1,4 +1,4 @@
-//! Reliability diagrams: how often poses of a probability are right.
+//! Reliability diagrams: the fraction of right poses against their probability.
 
 use sixfold_geometry::RgbImage;
 use sixfold_plot::{Canvas, text_width};
@@ -17,7 +17,7 @@ const BLUE: [u8; 3] = [0, 114, 178];
 const SIZE: f64 = 2.0;
 const LETTER: f64 = 7.0 * SIZE;
 
-/// One diagram beside the other.
+/// The diagrams side by side.
 pub(super) fn reliability(whole: &Whole) -> RgbImage {
     let columns = whole.rows.len().max(1);
     let mut canvas = Canvas::new((WIDTH * columns as f64) as usize, HEIGHT as usize);
@@ -46,7 +46,7 @@ fn diagram(canvas: &mut Canvas, left: f64, row: &Row) {
     let mut last = None;
     for bin in row.bins.iter().filter(|b| b.poses > 0) {
         let (x, y) = at(bin.probability, bin.right);
-        // The area says how many poses stand behind it.
+        // The area of the square is proportional to the number of poses.
         let side = 4.0 + 12.0 * (bin.poses as f64 / most).sqrt();
         canvas.rectangle(x - 0.5 * side, y - 0.5 * side, side, side, BLUE);
         if let Some(last) = last {

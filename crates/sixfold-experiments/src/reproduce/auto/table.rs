@@ -1,4 +1,4 @@
-//! What came of all searches, in numbers.
+//! Statistics of all searches.
 
 use std::fmt::Write;
 
@@ -22,27 +22,27 @@ pub(super) struct Bin {
     pub right: f64,
 }
 
-/// What came of the searches with the same images.
+/// Statistics of the searches with the same kind of images.
 #[derive(Debug, Serialize)]
 pub(super) struct Row {
     pub given: Given,
     /// Objects searched in images that show them.
     pub present: usize,
-    /// Of those, the fraction whose best pose is right.
+    /// Fraction of these whose best pose is right.
     pub found: f64,
-    /// Of the right ones, the fraction of at least [`REPORTED`].
+    /// Fraction of the right poses with a probability of at least [`REPORTED`].
     pub kept: f64,
-    /// Of the poses of at least [`REPORTED`], the fraction that is right.
+    /// Fraction of right poses among those with a probability of at least [`REPORTED`].
     pub precision: f64,
     /// Objects searched in images that do not show them.
     pub absent: usize,
-    /// Of those, the fraction that is reported all the same.
+    /// Fraction of these that is reported nevertheless.
     pub accepted: f64,
     /// Expected calibration error of the best poses (Naeini et al. 2015, ten bins).
     pub expected_error: f64,
     /// Area under the ROC curve of the best poses.
     pub auc: f64,
-    /// Seconds a search took on average.
+    /// Mean seconds per search.
     pub seconds: f64,
     pub bins: Vec<Bin>,
 }
@@ -119,7 +119,7 @@ fn auc(best: &[(bool, f64, bool)]) -> f64 {
     if pairs == 0.0 { 0.5 } else { wins / pairs }
 }
 
-/// The rows as a page.
+/// The rows as a page of markdown.
 pub(super) fn markdown(whole: &Whole) -> String {
     let mut out = "| given | objects in the image | best pose right | of these at least 0.5 | right of those at least 0.5 | \
                    objects not in the image | of these at least 0.5 | expected calibration error | AUC | s a search |\n\
@@ -175,7 +175,7 @@ mod tests {
         // .05 in the bins of two poses, .65 in two of one, .75, .05 in one of one each.
         let expected = (2.0 * 0.05 + 0.65 + 0.65 + 0.75 + 0.05) / 6.0;
         assert!((r.expected_error - expected).abs() < 1e-9, "{}", r.expected_error);
-        // Of nine pairs of a right and a wrong pose seven are in order.
+        // Seven of the nine pairs of a right and a wrong pose are in order.
         assert!((r.auc - 7.0 / 9.0).abs() < 1e-9);
         assert_eq!(r.seconds, 2.0);
         assert!(markdown(&whole).contains("| depth | 5 | 0.600 | 0.667 | 0.500 | 2 | 0.500 |"));

@@ -1,4 +1,5 @@
-//! Semantic grasps (figure 6.13): experience on handles alone steers the grasp to the handle of another object.
+//! Semantic grasps (figure 6.13): experience from handles only transfers the grasp to the handle of another
+//! object.
 
 use std::path::Path;
 
@@ -20,9 +21,9 @@ use sixfold_shell::grasp::trial::Hardness;
 use sixfold_shell::overlay;
 use sixfold_shell::progress::{Progress, check_interrupt};
 
-/// A handle of which less than this fraction of the object's pixels is seen gives no cue.
+/// Minimum fraction of the object's pixels that must show the handle; otherwise the view gives no cue.
 const MIN_SEEN: f64 = 0.02;
-/// Points this far off the named part's box still count as on it, metres.
+/// Points within this distance of the named part's box count as on it, metres.
 const AROUND: f64 = 0.006;
 
 /// One view of an object with a handle.
@@ -34,11 +35,11 @@ pub(super) struct Row {
     pub seen: f64,
     /// Whether the first grasp from experience on handles is on the handle; `None` where nothing was proposed.
     pub by_experience: Option<bool>,
-    /// The same of the planner's first grasp, which knows no handles.
+    /// The same for the planner's first grasp; the planner has no notion of handles.
     pub by_geometry: Option<bool>,
 }
 
-/// What the test needs.
+/// The inputs of the test.
 pub(super) struct Handles<'a> {
     pub objects: &'a [(String, String, Mesh)],
     pub parts: &'a [Option<PartBox>],
@@ -70,7 +71,7 @@ impl Handles<'_> {
                 rows.iter().filter(|r| r.object == *name).map(|r| r.number + 1).max().unwrap_or(0);
             (0..done).for_each(|_| progress.step(name.clone()));
             let parts = ConvexParts::of_mesh(mesh, &PartsOptions::default()).with_context(|| name.clone())?;
-            // Views from behind show no handle: the next ones are taken.
+            // Views from behind do not show the handle: skip them.
             while done < self.views && number < 8 * self.views as u64 {
                 check_interrupt("what was tried is kept; run the same command again to continue")?;
                 if let Some(row) = self.row(name, mesh, part, &parts, number, memory, folder)? {

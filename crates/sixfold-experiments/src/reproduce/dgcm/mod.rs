@@ -25,15 +25,15 @@ use sixfold_shell::grasp::object_list::{ObjectsArguments, file_name, objects_wit
 use sixfold_shell::grasp::trial::{PhysicsArguments, hardness};
 use sixfold_shell::output::{JsonArguments, report, write_atomically};
 
-/// Feature distance from which on experience proposes (dissertation, section 6.3.2).
+/// Largest feature distance at which experience proposes a grasp (dissertation, section 6.3.2).
 const NEAR: f64 = 0.9;
-/// Runs of learning from nothing, each from a seed of its own.
+/// Runs of learning from an empty store, each with its own seed.
 const RUNS: u64 = 4;
-/// How often each grasp of table 6.2 is tried, each time with another error of the hand.
+/// Number of tries of each grasp of table 6.2, each with another error of the hand.
 const TRIES: usize = 4;
-/// Classes that no grasp of this hand holds in the hard setting, or hardly: distinguished in the averages.
+/// Classes that grasps of this hand hardly ever hold in the hard setting; the averages are given with and without them.
 const HARDLY: [&str; 2] = ["plate", "scissors"];
-/// What is learned from nothing, by the end of its mesh's path.
+/// Objects that are learned from an empty store, by the end of the mesh's path.
 const FROM_NOTHING: [&str; 3] = ["PowerDrill.ply", "MustardBottle.ply", "Banana.ply"];
 
 #[derive(Debug, Args)]
@@ -68,7 +68,7 @@ struct Whole {
     handles: Vec<handles::Row>,
 }
 
-/// One object learned from nothing, in several runs.
+/// One object learned from an empty store, in several runs.
 #[derive(Serialize)]
 struct FromNothing {
     hard: bool,
@@ -81,7 +81,7 @@ impl FromNothing {
     }
 }
 
-/// A point of figure 6.7, left.
+/// A point in the left part of figure 6.7.
 #[derive(Serialize)]
 struct Point {
     class: String,
@@ -99,10 +99,10 @@ struct Pair {
     within: [f64; 2],
 }
 
-/// How it goes with objects stretched by at most a factor.
+/// Results for objects stretched by at most a factor.
 #[derive(Serialize)]
 struct Stretched {
-    /// The largest change of an axis: 1.2 stands for 1/1.2 to 1.2.
+    /// The largest change of an axis: 1.2 means 1/1.2 to 1.2.
     up_to: f64,
     asked: usize,
     within: [f64; 2],
@@ -159,7 +159,7 @@ pub(crate) fn run(a: &ReproduceDgcmArguments, json: &JsonArguments) -> Result<Ou
     } else {
         Size { views: 6, rounds: 5, stretched: 24 }
     };
-    // Views as a camera gives them; the hand's error has no part in this.
+    // Views as from a camera; the hand's error is not simulated here.
     let answers = Offline {
         instances: &instances,
         network: &network,
@@ -197,7 +197,8 @@ pub(crate) fn run(a: &ReproduceDgcmArguments, json: &JsonArguments) -> Result<Ou
     learn::learn(&LearnArguments {
         families: vec!["mug".to_owned(), "drill".to_owned()],
         members: if a.quick { 3 } else { 12 },
-        // Where the grasp goes is asked, not whether this hand could lift the object by it: the easy setting teaches more.
+        // The question is where the grasp is, not whether this hand could lift the object with it: the easy setting gives
+        // more experience.
         hard: false,
         tries: 10,
         part: Some("handle".to_owned()),
@@ -252,7 +253,7 @@ impl ReproduceDgcmArguments {
         folder.unwrap_or_default().join(name).display().to_string()
     }
 
-    /// Learning in the hard setting, on meshes in millimetres or on what is added.
+    /// Arguments of learning in the hard setting, on meshes in millimetres or on the objects added later.
     fn learning(&self, folder: &str, store: &Path, attempts: u64, meshes: Vec<String>) -> LearnArguments {
         LearnArguments {
             experiences: StorePlace::File(store.to_path_buf()),
@@ -485,7 +486,7 @@ impl Whole {
     }
 }
 
-/// How many attempts after the second success held, and of how many.
+/// The number of successful attempts after the second success, and the number of these attempts.
 fn after_second(held: &[bool]) -> (usize, usize) {
     let second = held.iter().enumerate().filter(|(_, h)| **h).nth(1).map_or(held.len(), |(k, _)| k + 1);
     (held[second..].iter().filter(|h| **h).count(), held.len() - second)

@@ -1,9 +1,9 @@
-//! Figure 6.7: how near a transferred grasp comes to the wanted one, against the number of experiences, and from every
-//! object to every other; and from an object to itself at other sizes.
+//! Figure 6.7: the error of a transferred grasp against the target grasp, over the number of experiences, between every pair
+//! of objects, and between an object and stretched copies of it.
 //!
-//! As in section 6.3.1 the wanted grasp comes from above, on the object's upright axis, and a rotation about the approach does
-//! not count. There the poses were annotated by hand on depth images; here they follow from the meshes, and the depth images
-//! are simulated. What is judged is the first grasp of the ranking by equation 6.6, whether it would hold or not.
+//! As in section 6.3.1, the target grasp is from above, on the object's upright axis, and a rotation about the approach
+//! direction is ignored. There the poses were annotated by hand on depth images; here they follow from the meshes, and the
+//! depth images are simulated. The first grasp of the ranking by equation 6.6 is evaluated, whether it would hold or not.
 
 use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet};
@@ -27,19 +27,19 @@ use sixfold_simulation::{AttemptOptions, ConvexParts, PartsOptions, scene};
 use sixfold_shell::grasp::journal::Journal;
 use sixfold_shell::progress::{Progress, check_interrupt};
 
-/// Experiences of each object that a test may know, at most.
+/// Maximum number of experiences of each object in a test.
 const POOL: usize = 8;
 /// Numbers of experiences that are compared.
 pub(super) const COUNTS: [usize; 4] = [1, 2, 4, 8];
-/// An object wider than the open gripper has no grasp from above; so much is left for the fingers, metres.
+/// Clearance for the fingers, metres: an object wider than the open gripper minus this clearance has no grasp from above.
 const ROOM: f64 = 0.01;
 
-/// An object with its wanted grasp.
+/// An object with its target grasp.
 pub(super) struct Instance {
     pub class: String,
     pub name: String,
     mesh: Mesh,
-    /// The wanted grasp, its width in metres.
+    /// The target grasp and its width in metres.
     grasp: (Pose, f64),
 }
 
@@ -81,15 +81,16 @@ struct View {
     instance: usize,
     number: u64,
     view: GraspView,
-    /// The wanted grasp in the camera's frame.
+    /// The target grasp in the camera's frame.
     wanted: Grasp,
 }
 
-/// One question: which experiences were known, and how near the answer came.
+/// One question: the available experiences, and the error of the answer.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub(super) struct Answer {
     pub question: Question,
-    /// Distance of the tips' middles, metres, and angle of the approaches, radians; `None` without a proposal.
+    /// Distance between the midpoints of the finger tips, metres, and angle between the approach directions, radians; `None`
+    /// without a proposal.
     pub error: Option<(f64, f64)>,
 }
 
@@ -104,24 +105,24 @@ pub(super) enum Question {
 }
 
 impl Answer {
-    /// Whether it is near enough.
+    /// Whether the error is within these limits.
     pub fn within(&self, distance: f64, degrees: f64) -> bool {
         self.error.is_some_and(|(d, a)| d <= distance && a <= degrees.to_radians())
     }
 }
 
-/// How much is asked.
+/// The extent of the experiments.
 #[derive(Debug, Clone, Copy, Serialize)]
 pub(super) struct Size {
     /// Tested views of each object.
     pub views: u64,
-    /// Draws of experiences for each number.
+    /// Random samples of experiences for each number.
     pub rounds: u64,
     /// Stretched copies of each object.
     pub stretched: u64,
 }
 
-/// What the offline experiments need.
+/// The inputs of the offline experiments.
 pub(super) struct Offline<'a> {
     pub instances: &'a [Instance],
     pub network: &'a DgcmModel,
@@ -173,7 +174,7 @@ impl Offline<'_> {
         Ok(answers.into_values().collect())
     }
 
-    /// The views that become experience, and those that are tested.
+    /// The views used as experience, and the tested views.
     fn views(&self, number: usize, instance: &Instance) -> Result<(Vec<View>, Vec<View>)> {
         let parts = ConvexParts::of_mesh(&instance.mesh, &PartsOptions::default())
             .with_context(|| instance.name.clone())?;
@@ -192,7 +193,7 @@ impl Offline<'_> {
         Ok((views, tests))
     }
 
-    /// One view with its wanted grasp; `None` where the object did not stand upright, or was not seen.
+    /// One view with its target grasp; `None` if the object did not stand upright or was not visible.
     fn view(
         &self,
         instance: usize,
@@ -229,7 +230,7 @@ impl Offline<'_> {
         Ok(memory.store().add(&experience)?.0)
     }
 
-    /// Every question with its view and the experiences that are known in it.
+    /// Every question with its view and the available experiences.
     fn questions<'v>(
         &self,
         known: &[Vec<i64>],
@@ -271,7 +272,7 @@ impl Offline<'_> {
         questions
     }
 
-    /// The error of the first grasp that these experiences propose.
+    /// The error of the first grasp proposed from these experiences.
     fn ask(&self, memory: &mut Memory, test: &View, only: BTreeSet<i64>) -> Result<Option<(f64, f64)>> {
         let options = AntipodalOptions::default();
         let fitter = GraspFitter::new(&test.view, self.gripper, &options)?;
@@ -298,7 +299,7 @@ impl Offline<'_> {
                 check_interrupt("what was answered is kept; run the same command again to continue")?;
                 progress.step(instance.name.clone());
                 let mut random = stream(self.seed ^ 0x73_7472, view);
-                // As many times smaller as larger; in hundredths, to be a key.
+                // Shrunk as often as enlarged; in hundredths, so that it can be a key.
                 let factors: [i64; 3] = std::array::from_fn(|_| {
                     (100.0 * 2f64.powf(random.random_range(-1.0..1.0))).round() as i64
                 });
@@ -342,7 +343,7 @@ mod tests {
         assert!((pose.translation() - Vec3::new(0.03, 0.05, 0.10)).norm() < 1e-9);
         assert!((pose.transform_direction(&Vec3::z()) + Vec3::z()).norm() < 1e-9);
         assert!((width - 0.06).abs() < 1e-9 && pose.transform_direction(&Vec3::x()).x.abs() > 0.999);
-        // Too wide for the hand.
+        // This one is too wide for the hand.
         let wide = mesh.vertices().iter().map(|p| p * 2.0).collect();
         assert!(from_above(&Mesh::new(wide, mesh.faces().to_vec()).unwrap(), &gripper).is_none());
     }

@@ -6,10 +6,10 @@ use sixfold_plot::{COLORS, Canvas, FAINT, INK, text_width};
 use super::offline::COUNTS;
 use sixfold_shell::grasp::learn::Curve;
 
-/// A line of the left image of figure 6.7: fractions for each number of experiences.
+/// A curve in the left part of figure 6.7: fractions for each number of experiences.
 pub(super) struct Line {
     pub class: String,
-    /// Experience of all classes; else of this one.
+    /// Whether experience of all classes is used, or only of this class.
     pub all: bool,
     pub shares: [f64; COUNTS.len()],
 }
@@ -61,7 +61,7 @@ pub(super) fn curves(title: &str, lines: &[Line]) -> RgbImage {
     canvas.finish()
 }
 
-/// Fractions from every object (rows) to every other (columns).
+/// Fractions for transfer from every object (rows) to every other (columns).
 pub(super) fn matrix(title: &str, names: &[String], shares: &[Vec<Option<f64>>]) -> RgbImage {
     let cell = 46.0;
     let widest = names.iter().map(|n| text_width(n, 1.5)).fold(0.0, f64::max);

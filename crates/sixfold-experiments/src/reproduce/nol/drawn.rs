@@ -1,8 +1,9 @@
-//! The same frames with poses that are exact: the coloured models drawn over images of other frames, under a lamp above the
-//! first object (so it stays with that object when the camera moves), and with table 4.1's changes of colour.
+//! The same frames with exact poses: the coloured models rendered over images of other frames, under a lamp above the first
+//! object (so it stays at the same place relative to the object when the camera moves), and with table 4.1's colour
+//! augmentation.
 //!
-//! Annotated poses of real photographs are off by pixels. Nothing can be nearer to them than they are to what the
-//! photographs show, and only of rendered objects is it known where they are.
+//! Annotated poses of real photographs have errors of some pixels, so no measured error can be smaller than these. Exact
+//! poses are known only for rendered objects.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -16,12 +17,12 @@ use sixfold_synth::augment::{Backgrounds, ColorAugmentation, Coverage, Patch};
 
 use super::material::{Material, PosedFrame};
 
-/// Pixels are drawn as squares of this many by as many.
+/// Each pixel is rendered as a square of this many by this many pixels.
 const FINE: usize = 2;
-/// What the lens and the sensor's mosaic blur, pixels.
+/// Blur of the lens and the sensor's mosaic, pixels.
 const LENS: f32 = 0.7;
 
-/// The material with drawn sources; targets and poses stay.
+/// The material with rendered sources; targets and poses stay.
 pub(super) fn drawn(material: &Material, seed: u64) -> Result<Material> {
     let others = material.targets.iter().map(|f| f.image.clone()).collect();
     let backgrounds = Backgrounds::from_images(others)?;
@@ -33,7 +34,7 @@ pub(super) fn drawn(material: &Material, seed: u64) -> Result<Material> {
     Ok(Material { meshes: material.meshes.clone(), sources: sources.collect(), targets: vec![] })
 }
 
-/// All rendered frames at half their size.
+/// Writes an image of all rendered frames at half their size.
 pub(super) fn picture(drawn: &Material, file: &Path) -> Result<()> {
     const COLUMNS: usize = 4;
     let size = |of: fn(&RgbImage) -> usize| drawn.sources.iter().map(|f| of(&f.image) / 2).max().unwrap_or(0);
@@ -70,7 +71,7 @@ fn draw(material: &Material, frame: &PosedFrame, backgrounds: &Backgrounds, rand
     let coverage = Coverage { width, height, data: coarse(&covered, width, height) };
     let mut over = Patch::filled(width, height, [0.0; 3]);
     for (plane, fine) in over.planes_mut().zip(colors.data.chunks_exact(covered.len())) {
-        // What is not covered is black, and counts as nothing.
+        // Pixels that are not covered are black and contribute nothing.
         plane.copy_from_slice(&coarse(fine, width, height));
         plane.iter_mut().zip(&coverage.data).filter(|(_, c)| **c > 0.0).for_each(|(v, c)| *v /= c);
     }

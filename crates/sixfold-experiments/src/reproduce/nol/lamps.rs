@@ -1,4 +1,4 @@
-//! A scene photographed under several lamps by a camera that stood still: each photograph predicted from the others.
+//! A scene photographed under several lamps by a static camera: each photograph is predicted from the others.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -17,22 +17,22 @@ use sixfold_shell::progress::{Progress, check_interrupt};
 
 /// Side of the crops: the objects are larger than in the other dataset.
 const SIDE: usize = 192;
-/// Less of an object is neither source nor target.
+/// Minimum visible fraction of an object as source or target.
 const MIN_VISIBILITY: f64 = 0.8;
 /// Objects with `--quick`.
 const QUICK: usize = 3;
 /// The name of these rows' only set.
 pub(super) const SET: &str = "other lamps";
 
-/// An object of the scene, once per place where it stands.
+/// An object of the scene, one entry per instance.
 struct Thing {
     object: u32,
-    /// Number in the ground truth.
+    /// Index in the ground truth.
     index: usize,
     mesh: Mesh,
     /// The same, textured, if there is one.
     textured: Option<Mesh>,
-    /// Under every lamp.
+    /// Its images under every lamp.
     photographs: Vec<PosedImage>,
 }
 

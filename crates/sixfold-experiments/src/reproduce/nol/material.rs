@@ -14,16 +14,16 @@ use sixfold_mesh::Mesh;
 
 use super::arguments::ReproduceNolArguments;
 
-/// Poses are off by up to this much: metres along each axis, radians about each.
+/// Largest disturbance of a pose: metres along each axis, radians about each.
 pub(super) const REACH: [f64; 2] = [0.01, 0.05];
-/// Objects of which less is visible are no sources.
+/// Minimum visible fraction of a source.
 const MIN_VISIBILITY: f64 = 0.5;
-/// Objects of which less is visible are no targets.
+/// Minimum visible fraction of a target.
 const MIN_TARGET_VISIBILITY: f64 = 0.8;
 /// Every n-th of the other frames; every n-th with `--quick`.
 const EVERY: [usize; 2] = [6, 24];
 
-/// A frame with what is in it.
+/// A frame with its objects.
 pub(super) struct PosedFrame {
     /// Scene and image.
     pub id: (u32, u32),
@@ -47,7 +47,7 @@ pub(super) struct Source {
     pub truth: Pose,
 }
 
-/// What everything is measured on.
+/// The data of all measurements.
 pub(super) struct Material {
     pub meshes: BTreeMap<u32, Mesh>,
     pub sources: Vec<PosedFrame>,
@@ -112,7 +112,7 @@ impl Material {
         self.sources.iter().map(|f| f.truth.iter().map(|(_, pose)| *pose).collect()).collect()
     }
 
-    /// The sources' poses, each disturbed evenly within [`REACH`].
+    /// The sources' poses, each disturbed uniformly within [`REACH`].
     pub fn disturbed(&self, seed: u64) -> Poses {
         let mut random = ChaCha8Rng::seed_from_u64(seed);
         let mut draw = |reach: f64| reach * (2.0 * random.random::<f64>() - 1.0);
@@ -125,7 +125,7 @@ impl Material {
         self.sources.iter().map(|f| f.truth.iter().map(|(_, pose)| disturb(pose)).collect()).collect()
     }
 
-    /// Photographs of everything that is visible enough at these poses, by object, with masks from all poses of a frame together.
+    /// Photographs of all sufficiently visible objects at these poses, by object, with masks from all poses of a frame together.
     pub fn photographs(&self, poses: &Poses) -> Result<Vec<Source>> {
         let mut all = vec![];
         for (number, (frame, poses)) in self.sources.iter().zip(poses).enumerate() {
@@ -141,7 +141,7 @@ impl Material {
                 all.push(Source { frame: number, index, object: *object, photograph, truth: *truth });
             }
         }
-        // By object, as the refinement reports them; the frames' order stays.
+        // Sort by object, as the refinement reports them; the order of the frames is kept.
         all.sort_by_key(|s| s.object);
         Ok(all)
     }
@@ -183,7 +183,7 @@ impl Material {
         Ok(all)
     }
 
-    /// Visible fraction and mask of everything in a frame.
+    /// Visible fraction and mask of every object in a frame.
     fn visible(&self, frame: &PosedFrame, poses: &[Pose]) -> Vec<(f64, sixfold_geometry::Mask)> {
         let placed: Vec<(&Mesh, Pose)> =
             frame.truth.iter().zip(poses).map(|((id, _), pose)| (&self.meshes[id], *pose)).collect();

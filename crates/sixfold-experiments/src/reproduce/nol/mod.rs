@@ -1,5 +1,5 @@
 //! `sixfold reproduce nol`: the tables of Neural Object Learning (dissertation, chapter 4) on a dataset: poses after refinement
-//! (section 4.2.3), views beside real pixels (table 4.6), wrong meshes (section 4.4.3), another lamp, and times.
+//! (section 4.2.3), views compared with real pixels (table 4.6), wrong meshes (section 4.4.3), another lamp, and times.
 
 pub(crate) mod arguments;
 mod drawn;
@@ -31,11 +31,11 @@ use sixfold_shell::Outcome;
 use sixfold_shell::output::{JsonArguments, report, write_atomically};
 use sixfold_shell::progress::{Progress, check_interrupt};
 
-/// Behind an interrupt.
+/// The message after an interrupt.
 const GO_ON: &str = "the rows done so far are kept; run the same command again to continue";
 /// Side of the views that are compared, pixels.
 const SIDE: usize = 128;
-/// What the views are rendered from, in the order of the table.
+/// The inputs of the views, in the order of the table.
 const SETS: [&str; 8] = [
     views::MODEL,
     "disturbed poses",
@@ -46,10 +46,10 @@ const SETS: [&str; 8] = [
     "vertices 1 mm off",
     lamps::SET,
 ];
-/// Disturbances; with `--quick` one.
+/// Number of disturbances; one with `--quick`.
 const DISTURBANCES: u64 = 3;
 
-/// What all rows have in common. Rows made with something else are not mixed with these.
+/// The inputs of all rows. Rows made from other inputs are not mixed with these.
 #[derive(Debug, PartialEq, Serialize)]
 struct Inputs {
     version: &'static str,
@@ -66,20 +66,20 @@ struct Inputs {
 #[derive(Serialize)]
 struct Whole {
     inputs: Inputs,
-    /// Whether only some rows were made. They are the same ones: without `--quick` the run continues with the others.
+    /// Whether only some rows were made. They are a subset of the full run, which continues with the others without `--quick`.
     quick: bool,
     disturbances: u64,
     poses: Vec<PosesSummary>,
-    /// The same of rendered frames, whose poses are exact.
+    /// The same for rendered frames, whose poses are exact.
     drawn_poses: Vec<PosesSummary>,
-    /// Targets that were compared, and that were left out.
+    /// Number of targets that were compared, and that were left out.
     targets_of_views: [usize; 2],
     views: Vec<ViewsSummary>,
     lamps: Vec<ViewsSummary>,
     speed: Speed,
 }
 
-/// What the parts share.
+/// The state that the parts share.
 struct Bench<'a> {
     a: &'a ReproduceNolArguments,
     material: Material,
@@ -158,13 +158,13 @@ pub(super) fn run(a: &ReproduceNolArguments, json: &JsonArguments) -> Result<Out
 }
 
 impl Bench<'_> {
-    /// All ways of refinement on one disturbance.
+    /// All variants of refinement on one disturbance.
     fn poses(&self, material: &Material, what: &str, seed: u64) -> Result<Vec<PosesRow>> {
         let sources = material.photographs(&material.disturbed(seed))?;
         if sources.is_empty() {
             bail!("--frames: none of the frames shows enough of an object");
         }
-        // The network of --weights; one to compare with is none.
+        // The network of --weights; a network for comparison does not count.
         let model = self.a.weights.as_ref().and_then(|_| self.networks.first()).map(|(_, model)| model);
         let mut rows = vec![];
         for (way, _) in poses::WAYS {
@@ -184,7 +184,7 @@ impl Bench<'_> {
         Ok(rows)
     }
 
-    /// Views of all objects in the frames that are no sources, from the poses of the first disturbance.
+    /// Views of all objects in the frames that are not sources, from the poses of the first disturbance.
     fn views(&self, rows: &[PosesRow]) -> Result<Vec<ViewRow>> {
         let rough = self.material.disturbed(self.a.seed);
         let disturbed = self.material.photographs(&rough)?;
@@ -225,7 +225,7 @@ impl Bench<'_> {
         let coarse: Mesh = views::coarse(mesh, 500)?;
         let rough: Mesh = views::rough(mesh, 0.001, self.a.seed)?;
         let mut ways: Vec<Way<'_>> = vec![];
-        // Encoding takes its time; with all rows there it is not needed.
+        // Encoding is slow, and not needed if all rows exist.
         if !keys.iter().all(kept) {
             let of = |sources: &[Source]| -> Vec<PosedImage> {
                 sources.iter().filter(|s| s.object == object).map(|s| s.photograph.clone()).collect()

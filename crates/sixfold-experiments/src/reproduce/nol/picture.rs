@@ -1,4 +1,4 @@
-//! Images of the views: a row per object, the photograph and what each way makes of it.
+//! Images of the views: one row per object, with the photograph and the view of each variant.
 
 use std::path::{Path, PathBuf};
 
@@ -13,7 +13,7 @@ use super::views::ViewRow;
 /// Height of the headings.
 const HEAD: usize = 40;
 
-/// Strips of crops, kept beside the rows: a row that is not made again still has its images.
+/// Strips of crops, stored beside the rows, so that a row that is not made again still has its images.
 pub(super) struct Strips {
     folder: PathBuf,
 }
@@ -27,7 +27,7 @@ impl Strips {
         self.folder.join(format!("{key}.png"))
     }
 
-    /// Keeps the crops of a row: the photograph, then its cells.
+    /// Stores the crops of a row: the photograph, then its cells.
     pub fn keep(&self, row: &ViewRow, pictures: &[Patch]) -> Result<()> {
         let Some(first) = pictures.first() else { return Ok(()) };
         if row.cells.is_empty() {
@@ -40,7 +40,8 @@ impl Strips {
         Ok(write_rgb(&self.path(&row.key), &strip)?)
     }
 
-    /// One image of the strips of these rows, with the cells of these sets. Nothing where there is no strip.
+    /// Writes one image of the strips of these rows, with the cells of these sets; nothing if there is no
+    /// strip.
     pub fn sheet(&self, file: &Path, rows: &[ViewRow], sets: &[&str]) -> Result<()> {
         let mut strips = vec![];
         for row in rows {

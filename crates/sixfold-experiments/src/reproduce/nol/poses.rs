@@ -17,7 +17,7 @@ use sixfold_nol::refine::{
 use super::material::{Material, Poses, Source};
 use sixfold_shell::output::pose_rows;
 
-/// Ways of refinement: key and title.
+/// Variants of refinement: key and title.
 pub(super) const WAYS: [(&str, &str); 6] = [
     ("printed", "printed rule, the network's rendering"),
     ("printed-average", "printed rule, mean of the colours"),
@@ -26,20 +26,21 @@ pub(super) const WAYS: [(&str, &str); 6] = [
     ("both", "ours, both"),
     (ANNOTATED, "ours, both, begun at the annotated poses"),
 ];
-/// Starts from the true poses, so that its errors are what photographs and annotations disagree by.
+/// This variant starts from the true poses, so its errors are the disagreement of photographs and
+/// annotations.
 pub(super) const ANNOTATED: &str = "annotated";
-/// The way whose poses the views are rendered from.
+/// The variant whose poses are used to render the views.
 pub(super) const BEST: &str = "both";
-/// Others behind the published rule first rendering.
+/// Number of other images used for the published rule's first rendering.
 const PER_VIEW: usize = 6;
 
-/// One way with one disturbance.
+/// One variant with one disturbance.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub(super) struct PosesRow {
     pub way: String,
     pub seed: u64,
     pub seconds: f64,
-    /// Whether the objects were found to have stood still; only where that is asked.
+    /// Whether the objects were found to be static; only for variants that test this.
     pub still: Option<bool>,
     pub sources: Vec<RefinedSource>,
 }
@@ -50,13 +51,13 @@ pub(super) struct RefinedSource {
     pub object: u32,
     pub before: PoseError,
     pub after: PoseError,
-    /// Rows of the new pose, metres.
+    /// The refined pose, row by row, metres.
     pub camera_from_object: [[f64; 4]; 4],
     /// Why it should not be used.
     pub dropped: Option<String>,
 }
 
-/// Metres at the centre of the object's box, and radians.
+/// Errors of a pose: metres at the centre of the object's box, and radians.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub(super) struct PoseError {
     pub distance: f64,
@@ -85,7 +86,7 @@ impl PoseError {
 }
 
 impl PosesRow {
-    /// The poses of all sources; others stay as `poses` has them.
+    /// Writes the refined poses of all sources into `poses`; other poses stay.
     pub fn put_into(&self, sources: &[Source], poses: &mut Poses) -> Result<()> {
         for (s, refined) in sources.iter().zip(&self.sources) {
             let rows = refined.camera_from_object;
@@ -96,7 +97,7 @@ impl PosesRow {
     }
 }
 
-/// Refines the sources in one way.
+/// Refines the sources with one variant.
 pub(super) fn refine(
     material: &Material,
     sources: &[Source],
@@ -175,7 +176,7 @@ pub(super) struct PosesSummary {
     pub objects: BTreeMap<u32, Medians>,
     /// Seconds for all sources of one disturbance; `None` for the disturbed poses themselves.
     pub seconds: Option<f64>,
-    /// Sources that were found to be too far off.
+    /// Sources that were rejected because their poses had too large errors.
     pub dropped: usize,
 }
 
@@ -186,14 +187,14 @@ pub(super) struct Medians {
     pub millimetres_across: f64,
     pub millimetres_along: f64,
     pub degrees: f64,
-    /// Fraction of the disturbed sources whose box's corners came nearer to their places.
+    /// Fraction of the disturbed sources whose box corners came closer to their true positions.
     pub improved: Option<f64>,
 }
 
-/// The disturbed poses, then every way.
+/// The disturbed poses, then every variant.
 pub(super) fn summaries(rows: &[PosesRow]) -> Vec<PosesSummary> {
     let mut all = vec![];
-    // What was disturbed is the same for every way.
+    // The disturbance is the same for every variant.
     if let Some(first) = rows.first() {
         let of: Vec<&PosesRow> = rows.iter().filter(|r| r.way == first.way).collect();
         all.push(PosesSummary { seconds: None, dropped: 0, ..summary("disturbed", &of, |s| s.before) });
@@ -235,7 +236,7 @@ fn summary(title: &str, rows: &[&PosesRow], error: impl Fn(&RefinedSource) -> Po
     }
 }
 
-/// The middle value, or the mean of the two.
+/// The middle value, or the mean of the two middle ones.
 fn median(mut values: Vec<f64>) -> f64 {
     stats::median(&mut values).unwrap_or(f64::NAN)
 }

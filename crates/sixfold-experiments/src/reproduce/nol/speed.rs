@@ -1,4 +1,4 @@
-//! How long a view and a refinement take.
+//! Times of a view and of a refinement.
 
 use std::time::Instant;
 
@@ -33,16 +33,16 @@ pub(super) struct Speed {
 /// Means over the views.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub(super) struct ViewTime {
-    /// How colours become one.
+    /// The method of combining colours.
     pub method: String,
     pub seconds: f64,
-    /// Photographs behind a view.
+    /// Photographs per view.
     pub sources: f64,
 }
 
 pub(super) fn measure(material: &Material, sources: &[Source], networks: &Networks) -> Result<Speed> {
     let count = |object: &u32| sources.iter().filter(|s| s.object == *object).count();
-    // The first of equals.
+    // The first one of several with equal numbers.
     let most = material.meshes.keys().map(count).max().unwrap_or(0);
     let object = material.meshes.keys().copied().find(|o| count(o) == most).unwrap_or(0);
     let mesh = &material.meshes[&object];

@@ -1,4 +1,4 @@
-//! Views rendered from photographs beside the real pixels (table 4.6), also with meshes that are wrong (section 4.4.3).
+//! Views rendered from photographs compared with the real pixels (table 4.6), also with wrong meshes (section 4.4.3).
 
 use anyhow::Result;
 use rand::SeedableRng;
@@ -16,46 +16,46 @@ use sixfold_nol::synthesis::{ViewMaker, Weighting};
 use sixfold_render::{Light, Material as Surface, RenderOptions, SceneObject, VisibilityBuffer, shade};
 use sixfold_synth::augment::Patch;
 
-/// Photographs behind a view (dissertation: 6).
+/// Photographs per view (dissertation: 6).
 pub(super) const PER_VIEW: usize = 6;
-/// Targets with fewer pixels that all ways show are left out.
+/// Targets with fewer pixels that all variants show are left out.
 const MIN_PIXELS: usize = 200;
-/// Views are moved by up to this many pixels of the crop to where they are most like the photograph.
+/// Views are shifted by up to this many pixels of the crop to maximise their similarity to the photograph.
 pub(super) const MOVED: usize = 6;
-/// The model's own colours are no view from photographs.
+/// The set of the model's own colours, which is not a view from photographs.
 pub(super) const MODEL: &str = "model";
 
-/// The networks that views are made with: names and models; the first is the one asked for.
+/// The networks for views: names and models; the first is the one of --weights.
 pub(super) type Networks = [(String, NolModel)];
 
-/// One way to render a target.
+/// One variant of rendering a target.
 pub(super) struct Way<'a> {
     /// Poses and mesh.
     pub set: &'static str,
-    /// How colours become one.
+    /// The method of combining colours.
     pub method: String,
     pub maker: ViewMaker<'a>,
 }
 
-/// What one way came to on one target.
+/// The result of one variant on one target.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub(super) struct Cell {
     pub set: String,
     pub method: String,
     /// As rendered.
     pub plain: Similarity,
-    /// After a gain and an offset per channel that fit best.
+    /// After the best gain and offset per channel.
     pub lit: Similarity,
-    /// After that and a shift, away from the border; `None` where too little is left of the object there.
+    /// After that and the best shift, without pixels near the border; `None` if too little of the object is left.
     pub placed: Option<Similarity>,
     /// Fraction of the object's pixels that no source shows.
     pub unseen: f64,
 }
 
-/// One target, rendered in all ways; no cells where too little of it is shown by all.
+/// One target, rendered with all variants; without cells if too little of it is shown by all.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub(super) struct ViewRow {
-    /// Its file's name.
+    /// Name of its file.
     pub key: String,
     pub frame: (u32, u32),
     pub object: u32,
@@ -64,8 +64,8 @@ pub(super) struct ViewRow {
     pub cells: Vec<Cell>,
 }
 
-/// Plain texturing, averaging and every network with these sources; `judged` takes out of each photograph what the others do
-/// not agree with.
+/// Plain texturing, averaging and every network with these sources; `judged` removes from each photograph the pixels that
+/// the others contradict.
 pub(super) fn ways<'a>(
     set: &'static str,
     mesh: &'a Mesh,
@@ -74,7 +74,7 @@ pub(super) fn ways<'a>(
     side: usize,
     judged: bool,
 ) -> Vec<Way<'a>> {
-    // A photograph that cannot be cut out shows nothing.
+    // A photograph that cannot be cropped contributes nothing.
     let mut views: Vec<SourceView> =
         sources.iter().filter_map(|p| SourceView::new(p, mesh, side).ok()).collect();
     if judged {
@@ -93,18 +93,18 @@ pub(super) fn ways<'a>(
         .collect()
 }
 
-/// A target that is to be rendered.
+/// A target to be rendered.
 pub(super) struct Target<'a> {
     pub key: &'a str,
     pub frame: (u32, u32),
     pub object: u32,
     pub photograph: &'a PosedImage,
-    /// The mesh as it is, for what the model itself looks like; with colours if it has any.
+    /// The mesh for the view of the model itself, with colours if it has any.
     pub mesh: &'a Mesh,
     pub side: usize,
 }
 
-/// Renders a target in all ways and compares; also the images: the photograph, then one per cell.
+/// Renders a target with all variants and compares them; also returns the images: the photograph, then one per cell.
 pub(super) fn compare(
     target: &Target<'_>,
     ways: &[Way<'_>],
@@ -170,7 +170,7 @@ pub(super) fn compare(
     Ok((row, pictures))
 }
 
-/// The object before grey.
+/// The object on a grey background.
 fn on_grey(patch: &Patch, mask: &Mask) -> Patch {
     let area = mask.as_slice().len();
     let mut out = Patch::filled(patch.width, patch.height, [0.5; 3]);
@@ -180,13 +180,13 @@ fn on_grey(patch: &Patch, mask: &Mask) -> Patch {
     out
 }
 
-/// The mesh with at most so many faces.
+/// The mesh with at most `faces` faces.
 pub(super) fn coarse(mesh: &Mesh, faces: usize) -> Result<Mesh> {
     let simple = simplify(mesh, faces);
     Ok(Mesh::new(simple.vertices().to_vec(), simple.faces().to_vec())?)
 }
 
-/// The mesh with vertices moved by a normal distribution, metres along each axis.
+/// The mesh with normally distributed noise on the vertices, metres along each axis.
 pub(super) fn rough(mesh: &Mesh, deviation: f64, seed: u64) -> Result<Mesh> {
     let mut random = ChaCha8Rng::seed_from_u64(seed);
     let mut moved = |v: &Vec3| v + Vec3::from_fn(|_, _| deviation * f64::from(normal(&mut random)));
@@ -194,7 +194,7 @@ pub(super) fn rough(mesh: &Mesh, deviation: f64, seed: u64) -> Result<Mesh> {
     Ok(Mesh::new(vertices, mesh.faces().to_vec())?)
 }
 
-/// Means of one way over the targets.
+/// Means of one variant over the targets.
 #[derive(Debug, Clone, Serialize)]
 pub(super) struct ViewsSummary {
     pub set: String,
@@ -202,14 +202,15 @@ pub(super) struct ViewsSummary {
     pub targets: usize,
     pub plain: Similarity,
     pub lit: Similarity,
-    /// Over those targets that are large enough.
+    /// Mean over the targets that are large enough.
     pub placed: Similarity,
     pub unseen: f64,
-    /// Fraction of the targets on which it is perceptually nearer to the photograph than averaging from the same sources.
+    /// Fraction of the targets on which it is perceptually more similar to the photograph than averaging from the same
+    /// sources.
     pub better_than_average: Option<f64>,
 }
 
-/// Means over targets, in the order in which the ways first appear.
+/// Means over targets, in the order in which the variants first appear.
 pub(super) fn summaries(rows: &[ViewRow]) -> Vec<ViewsSummary> {
     let mut names: Vec<(&str, &str)> = vec![];
     for cell in rows.iter().flat_map(|r| &r.cells) {
@@ -217,7 +218,7 @@ pub(super) fn summaries(rows: &[ViewRow]) -> Vec<ViewsSummary> {
             names.push((&cell.set, &cell.method));
         }
     }
-    // Where the photographs of one target do not allow some way, that order may be mixed up.
+    // If a variant is not possible for the photographs of one target, that order may be wrong.
     names.sort_by_key(|(set, _)| super::SETS.iter().position(|s| s == set));
     let find = |row: &ViewRow, set: &str, method: &str| {
         row.cells.iter().find(|c| c.set == set && c.method == method).cloned()

@@ -1,5 +1,5 @@
-//! A synthetic object that looks the same from four sides, as a small BOP dataset: what the symmetry pool of the
-//! transformer loss is for, and real datasets hardly have.
+//! A synthetic object that looks the same from four sides, as a small BOP dataset. The symmetry pool of the
+//! transformer loss is meant for such objects, which are rare in real datasets.
 
 use std::path::Path;
 
@@ -23,7 +23,7 @@ pub(super) const OBJECT: u32 = 1;
 /// Test images.
 const IMAGES: u32 = 120;
 
-/// Writes the dataset to `folder` unless it is there.
+/// Writes the dataset to `folder` unless it exists.
 pub(super) fn write(folder: &Path, seed: u64) -> Result<()> {
     let targets_file = folder.join("test_targets_bop19.json");
     if targets_file.exists() {
@@ -47,7 +47,7 @@ pub(super) fn write(folder: &Path, seed: u64) -> Result<()> {
         check_interrupt("run the same command again to continue")?;
         let mut random = stream(seed, im_id.into());
         let mut draw = |low: f32, high: f32| f64::from(uniform(&mut random, [low, high]));
-        // From above, at any rotation, the object upright in the image give or take 30 degrees.
+        // From above, at any azimuth, with the object upright in the image within 30 degrees.
         let (azimuth, elevation, roll) = (draw(-3.2, 3.2), draw(0.1, 1.3), draw(-0.5, 0.5));
         let (x, y, z) = (draw(-0.08, 0.08), draw(-0.05, 0.05), draw(0.6, 1.0));
         let down = Rotation3::from_axis_angle(&Vec3::x_axis(), std::f64::consts::FRAC_PI_2 + elevation);
@@ -88,7 +88,7 @@ pub(super) fn write(folder: &Path, seed: u64) -> Result<()> {
     }
     progress.finish();
     writer.finish()?;
-    // Last: it says that all the rest is there.
+    // Written last: its existence means that the dataset is complete.
     Ok(write_targets(&targets_file, &targets)?)
 }
 

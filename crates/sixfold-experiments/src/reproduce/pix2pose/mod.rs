@@ -1,8 +1,8 @@
 //! `sixfold reproduce pix2pose`: the method's tables on a dataset from one command, row by row, resumable.
 //!
-//! Test targets are those of the dataset outside the frames that the model was trained on. Every row is one way of using
-//! the model; its poses (`rows/KEY.csv`, BOP's format) and scores (`rows/KEY.json`) stay in the output folder and are not
-//! computed again.
+//! Test targets are those of the dataset outside the frames on which the model was trained. Every row is one variant of using the
+//! model; its poses (`rows/KEY.csv`, BOP's format) and scores (`rows/KEY.json`) stay in the output folder and are not computed
+//! again.
 
 mod fourfold;
 mod model;
@@ -79,7 +79,7 @@ pub(crate) struct ReproducePix2PoseArguments {
     pub seed: u64,
 }
 
-/// What all rows have in common. Rows made with something else are not mixed with these.
+/// The inputs of all rows. Rows made from other inputs are not mixed with these.
 #[derive(Debug, PartialEq, Serialize)]
 struct Inputs {
     version: &'static str,
@@ -102,7 +102,7 @@ struct Whole {
     frames: usize,
     targets: usize,
     rows: Vec<Row>,
-    /// What the dissertation and the challenge report, not measured here.
+    /// Values from the dissertation and the challenge, not measured here.
     literature: BTreeMap<&'static str, f64>,
 }
 
@@ -119,9 +119,9 @@ struct Bench {
 
 /// A file of detections.
 struct Detections {
-    /// The file's name without its ending.
+    /// The file's name without its extension.
     name: String,
-    /// FNV-1a of the file: another file's rows are others.
+    /// FNV-1a of the file, which distinguishes the rows of different files.
     hash: u64,
     regions: Regions,
 }
@@ -216,7 +216,7 @@ pub(crate) fn run(a: &ReproducePix2PoseArguments, json: &JsonArguments) -> Resul
     Ok(if any { Outcome::Found } else { Outcome::NothingFound })
 }
 
-/// The ways of using the model that are compared.
+/// The compared variants of using the model.
 fn settings(bench: &Bench) -> Vec<Setting> {
     let plain = Setting::plain;
     let mut all = vec![
@@ -289,7 +289,7 @@ fn settings(bench: &Bench) -> Vec<Setting> {
     all
 }
 
-/// The dataset's targets outside the training frames, for objects that the model knows.
+/// The dataset's targets outside the training frames, for the objects of the model.
 fn test_targets(
     a: &ReproducePix2PoseArguments,
     dataset: &BopDataset,
@@ -304,7 +304,7 @@ fn test_targets(
         eprintln!("note: {others} targets are of objects that the model does not know; they are left out");
         targets.retain(known);
     }
-    // The model's card states what it was trained on: scores on those frames would be worth nothing.
+    // The model's card states its training frames: scores on them would be meaningless.
     let card = pix2pose.model().card();
     for t in &targets {
         let frame = FrameId::new(t.scene_id, t.im_id);

@@ -1,4 +1,4 @@
-//! A trained model with its objects, as the rows of the table use it.
+//! A trained model with its objects, for the rows of the table.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -25,7 +25,7 @@ impl Pix2Pose {
         Ok(Pix2Pose { estimator: Pix2PoseEstimator::load(weights)?, objects: Arc::default() })
     }
 
-    /// The same model used in another way.
+    /// The same model with other options.
     pub fn varied(&self, options: AlignOptions, refine: bool) -> Pix2Pose {
         let estimator = Pix2PoseEstimator { options, refine, ..self.estimator.clone() };
         Pix2Pose { estimator, objects: self.objects.clone() }
@@ -36,7 +36,7 @@ impl Pix2Pose {
         &self.estimator.model
     }
 
-    /// An error unless the mesh is that of the model's object `id`: same place and size in its frame.
+    /// An error unless the mesh matches the model's object `id`: the same position and size in its frame.
     pub fn check_mesh(&self, id: u32, mesh: &Mesh, name: &str) -> Result<()> {
         self.object(id, mesh, name).map(|_| ())
     }

@@ -1,4 +1,4 @@
-//! One row of the table: a way of using the model, what it scored and how long it took.
+//! One row of the table: a variant of using the model, its scores and its times.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -17,51 +17,52 @@ use super::model::Pix2Pose;
 use super::{Bench, Regions};
 use sixfold_shell::progress::{Progress, check_interrupt};
 
-/// A way of using the model.
+/// A variant of using the model.
 pub(super) struct Setting {
     /// Name of its files.
     pub key: String,
-    /// What the table says.
+    /// Its title in the table.
     pub title: String,
     pub options: Pix2PoseOptions,
-    /// Whether the outline is aligned at the end.
+    /// Whether the outline is aligned as the last step.
     pub refine: bool,
-    /// With it: how often is looked.
+    /// With refinement: the number of passes.
     pub looks: usize,
-    /// With it: whether what the model is known to be off by is taken out.
+    /// With refinement: whether the model's known systematic error is corrected.
     pub correct: bool,
-    /// With it: whether borders are attracted to edges of the image.
+    /// With refinement: whether borders are attracted to edges of the image.
     pub edges: bool,
     /// Ground-truth boxes are moved and scaled by up to this fraction of their size.
     pub noise: Option<f64>,
     /// Half of every box, at one of its sides, is made black, as in the dissertation's figure 3.12.
     pub half_black: bool,
-    /// Boxes of this file of detections instead of the ground truth's.
+    /// Index of the file of detections whose boxes replace the ground truth's.
     pub detections: Option<usize>,
 }
 
-/// A row as it is kept.
+/// A row as it is stored.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub(super) struct Row {
     pub key: String,
     pub title: String,
     pub boxes: String,
     pub scores: Scores,
-    /// Of detections: how good their boxes are.
+    /// For detections: the quality of their boxes.
     #[serde(default)]
     pub detection: Option<RightBoxes>,
-    /// Boxes looked into.
+    /// Number of boxes that were searched.
     pub regions: usize,
-    /// Poses found in them.
+    /// Number of poses found in them.
     pub found: usize,
-    /// Per box: crops, both stages, PnP and, where it is done, refinement.
+    /// Per box: crops, both stages, PnP and, if used, refinement.
     pub milliseconds: Option<Times>,
 }
 
-/// Detections as table 3.9 of the dissertation judges them.
+/// Quality of detections, as in table 3.9 of the dissertation.
 #[derive(Debug, Clone, Copy, Serialize, Deserialize)]
 pub(super) struct RightBoxes {
-    /// Fraction of the targets whose best box overlaps the visible ground truth's by more than half.
+    /// Fraction of the targets whose best box has an intersection over union above one half with the visible
+    /// ground truth's box.
     pub share: f64,
     /// ADD(-S) below a tenth of the diameter over these targets alone.
     pub add_s: Option<f64>,
@@ -113,7 +114,7 @@ impl Setting {
         }
     }
 
-    /// The model used in this way.
+    /// The model with the options of this variant.
     pub fn of(&self, pix2pose: &Pix2Pose, seed: u64) -> Pix2Pose {
         let mut options = AlignOptions {
             estimate: Pix2PoseOptions { seed, ..self.options.clone() },
@@ -127,7 +128,7 @@ impl Setting {
         pix2pose.varied(options, self.refine)
     }
 
-    /// Where the boxes come from, in words.
+    /// The source of the boxes, in words.
     fn name_of_boxes(&self, detections: Option<&str>) -> String {
         match (detections, self.noise) {
             (Some(name), _) => name.to_owned(),
@@ -138,7 +139,7 @@ impl Setting {
 }
 
 impl Bench {
-    /// Estimates all targets in one way, keeps the poses and scores them.
+    /// Estimates all targets with one variant, stores the poses and scores them.
     pub(super) fn measure(&self, pix2pose: &Pix2Pose, setting: &Setting, folder: &Path) -> Result<Row> {
         let detections = setting.detections.and_then(|number| self.detections.get(number));
         let boxes = detections.map_or(&self.truth, |d| &d.regions);
@@ -217,7 +218,7 @@ impl Bench {
         Ok(row)
     }
 
-    /// How many targets were detected, and the poses of those alone.
+    /// The fraction of detected targets, and the recall of poses on these targets.
     fn right_boxes(&self, detected: &Regions, estimates: &[Estimate]) -> Result<RightBoxes> {
         let overlaps = |t: &&Target| {
             let Some(key) = t.object.map(|o| (t.scene_id, t.im_id, o.obj_id)) else { return false };
@@ -285,7 +286,7 @@ impl Bench {
     }
 }
 
-/// Boxes that overlap more are right.
+/// Boxes with a larger overlap are right.
 const RIGHT_BOX: f64 = 0.5;
 
 /// Intersection over union.
@@ -311,7 +312,8 @@ fn half_black(image: &RgbImage, region: &Rect, side: u64) -> RgbImage {
     })
 }
 
-/// The box with centre and sides moved by up to `share` of its sides; a box and a seed always give the same.
+/// The box with centre and sides changed by up to the fraction `share` of its sides; the same box and seed
+/// give the same result.
 fn moved(region: &Rect, share: f64, seed: [u64; 5]) -> Rect {
     let number = seed.iter().fold(0u64, |sum, v| sum.wrapping_mul(1_000_003).wrapping_add(*v));
     let mut random = ChaCha8Rng::seed_from_u64(number);

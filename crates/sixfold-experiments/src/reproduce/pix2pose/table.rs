@@ -10,7 +10,7 @@ fn digits(score: Option<f64>) -> String {
     score.map_or_else(|| "-".into(), |s| format!("{s:.3}"))
 }
 
-/// Pose recall against the detector, as table 3.9 of the dissertation; nothing without detections.
+/// Pose recall against detector quality, as in table 3.9 of the dissertation; empty without detections.
 fn against_detection(rows: &[Row]) -> String {
     if rows.iter().all(|r| r.detection.is_none()) {
         return String::new();

@@ -1,6 +1,6 @@
-//! Networks trained for a comparison: symmetric objects with the transformer loss, with L1 and view limits, and with
-//! plain L1 (table 3.1), and two others with their convex hulls in place of the meshes, from photographs alone, and with a
-//! discriminator and without (figure 3.12), on whole boxes and on boxes of which half is black.
+//! Networks trained for a comparison: symmetric objects with the transformer loss, with L1 and view limits, and with plain
+//! L1 (table 3.1); and two other objects with convex hulls instead of meshes, from photographs alone, and with and without
+//! a discriminator (figure 3.12), on whole boxes and on half-black boxes.
 
 use std::path::{Path, PathBuf};
 
@@ -14,12 +14,12 @@ use super::row::{Row, Setting};
 use super::{Bench, Regions, ReproducePix2PoseArguments, fourfold};
 use sixfold_shell::training::{MaterialArguments, Shown, command_line, loss, train_in, training_set};
 
-/// What a training of the comparison learns.
+/// The objects of a training.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Of {
     /// The dataset's objects with discrete symmetries.
     Symmetric,
-    /// The first two without.
+    /// The first two objects without discrete symmetries.
     Others,
     /// A synthetic object with four equal sides, from renders.
     Fourfold,
@@ -30,7 +30,7 @@ struct Training {
     key: &'static str,
     title: &'static str,
     of: Of,
-    /// What differs from the defaults.
+    /// The changes to the default recipe.
     vary: fn(&mut Pix2PoseRecipe),
 }
 
@@ -54,7 +54,7 @@ const TRAININGS: [Training; 9] = [
     }),
 ];
 
-/// Trains, or continues with the trainings, and measures what they came to.
+/// Trains the networks, or resumes the trainings, and measures their results.
 pub(super) fn rows(a: &ReproducePix2PoseArguments, bench: &Bench) -> Result<Vec<Row>> {
     let infos = bench.dataset.models_info(Models::Rendering)?.unwrap_or_default();
     let symmetric = |id: &u32| infos.0.get(id).is_some_and(|i| !i.symmetries_discrete.is_empty());
@@ -109,7 +109,7 @@ pub(super) fn rows(a: &ReproducePix2PoseArguments, bench: &Bench) -> Result<Vec<
 }
 
 impl Bench {
-    /// The same for a few objects.
+    /// The same benchmark with only a few objects.
     fn of_objects(&self, ids: &[u32]) -> Bench {
         let mine = |regions: &Regions| {
             regions.iter().filter(|(key, _)| ids.contains(&key.2)).map(|(k, v)| (*k, v.clone())).collect()
@@ -132,7 +132,7 @@ impl Bench {
 }
 
 impl Training {
-    /// Trains, or continues, and says where the model is.
+    /// Trains or resumes a training; returns the path of the model.
     fn train(
         &self,
         a: &ReproducePix2PoseArguments,
