@@ -83,36 +83,15 @@ pub fn evaluate_coco(
 ) -> CocoScores {
     let images: BTreeSet<(u32, u32)> = ground_truth.images.iter().copied().collect();
     let categories: BTreeSet<u32> = ground_truth.annotations.iter().map(|a| a.category_id).collect();
-    type Key = (u32, (u32, u32));
     let mut annotated: BTreeMap<Key, Vec<&Annotation>> = BTreeMap::new();
     for a in &ground_truth.annotations {
         annotated.entry((a.category_id, (a.scene_id, a.image_id))).or_default().push(a);
     }
-    let mut detected: BTreeMap<Key, Vec<Candidate<'_>>> = BTreeMap::new();
-    for d in detections {
-        let mask = d.segmentation.as_ref();
-        let Some(bbox) = d.bbox.or_else(|| mask.map(Rle::bounding_box)) else { continue };
-        if iou_type == IouType::Mask && mask.is_none() {
-            continue;
-        }
-        // The reference takes the area of the box wherever there is one, also for masks.
-        let area = match (d.bbox, mask) {
-            (None, Some(mask)) => mask.area() as f64,
-            _ => bbox.width * bbox.height,
-        };
-        let candidate = Candidate { score: d.score, area, bbox, mask };
-        detected.entry((d.category_id, (d.scene_id, d.image_id))).or_default().push(candidate);
-    }
-    for candidates in detected.values_mut() {
-        candidates.sort_by(|a, b| b.score.total_cmp(&a.score));
-        candidates.truncate(MAX_DETECTIONS[2]);
-    }
+    let detected = candidates(detections, iou_type);
 
     let overlaps = linspace(0.5, 0.95, OVERLAPS);
     let recalls = linspace(0.0, 1.0, 101);
-    // precision[area][overlap] and recall[area][most][overlap]: one number per object that has ground truth.
-    let mut precision = vec![vec![Vec::new(); OVERLAPS]; AREAS.len()];
-    let mut recall = vec![vec![vec![Vec::new(); OVERLAPS]; MAX_DETECTIONS.len()]; AREAS.len()];
+    let mut curves = Curves::new();
     for &category in &categories {
         let with_overlaps: Vec<_> = images
             .iter()
@@ -127,50 +106,106 @@ pub fn evaluate_coco(
                 .iter()
                 .map(|(gts, dts, ious)| match_image(gts, dts, ious, area, &overlaps))
                 .collect();
-            let positives: usize = results.iter().map(|r| r.positives).sum();
-            if positives == 0 {
-                continue;
+            curves.add(a, &results, &recalls);
+        }
+    }
+    curves.scores()
+}
+
+/// An object and an image.
+type Key = (u32, (u32, u32));
+
+/// The detections of every object in every image by decreasing score, at most as many as are scored. Detections without a box or,
+/// where masks are compared, without a mask are left out.
+fn candidates(detections: &[Detection], iou_type: IouType) -> BTreeMap<Key, Vec<Candidate<'_>>> {
+    let mut detected: BTreeMap<Key, Vec<Candidate<'_>>> = BTreeMap::new();
+    for d in detections {
+        let mask = d.segmentation.as_ref();
+        let Some(bbox) = d.bbox.or_else(|| mask.map(Rle::bounding_box)) else { continue };
+        if iou_type == IouType::Mask && mask.is_none() {
+            continue;
+        }
+        // pycocotools takes the area of the box if there is one, also for masks.
+        let area = match (d.bbox, mask) {
+            (None, Some(mask)) => mask.area() as f64,
+            _ => bbox.width * bbox.height,
+        };
+        let candidate = Candidate { score: d.score, area, bbox, mask };
+        detected.entry((d.category_id, (d.scene_id, d.image_id))).or_default().push(candidate);
+    }
+    for candidates in detected.values_mut() {
+        candidates.sort_by(|a, b| b.score.total_cmp(&a.score));
+        candidates.truncate(MAX_DETECTIONS[2]);
+    }
+    detected
+}
+
+/// Precision and recall of all objects; objects without ground truth of an area count nothing.
+struct Curves {
+    /// Per area and overlap: the precisions at 101 recalls of every object.
+    precision: Vec<Vec<Vec<f64>>>,
+    /// Per area, number of detections and overlap: the recall of every object.
+    recall: Vec<Vec<Vec<Vec<f64>>>>,
+}
+
+impl Curves {
+    fn new() -> Curves {
+        Curves {
+            precision: vec![vec![Vec::new(); OVERLAPS]; AREAS.len()],
+            recall: vec![vec![vec![Vec::new(); OVERLAPS]; MAX_DETECTIONS.len()]; AREAS.len()],
+        }
+    }
+
+    /// Adds the images of one object, matched for the area with number `area`.
+    fn add(&mut self, area: usize, results: &[ImageResult], recalls: &[f64]) {
+        let positives: usize = results.iter().map(|r| r.positives).sum();
+        if positives == 0 {
+            return;
+        }
+        for (m, &most) in MAX_DETECTIONS.iter().enumerate() {
+            let mut order: Vec<(f64, usize, usize)> = Vec::new();
+            for (i, result) in results.iter().enumerate() {
+                order.extend(result.scores.iter().take(most).enumerate().map(|(d, &s)| (s, i, d)));
             }
-            for (m, &most) in MAX_DETECTIONS.iter().enumerate() {
-                let mut order: Vec<(f64, usize, usize)> = Vec::new();
-                for (i, result) in results.iter().enumerate() {
-                    order.extend(result.scores.iter().take(most).enumerate().map(|(d, &s)| (s, i, d)));
-                }
-                order.sort_by(|a, b| b.0.total_cmp(&a.0));
-                for t in 0..OVERLAPS {
-                    let (p, r) = precision_and_recall(&results, &order, t, positives, &recalls);
-                    recall[a][m][t].push(r);
-                    if most == MAX_DETECTIONS[2] {
-                        precision[a][t].extend(p);
-                    }
+            order.sort_by(|a, b| b.0.total_cmp(&a.0));
+            for t in 0..OVERLAPS {
+                let (p, r) = precision_and_recall(results, &order, t, positives, recalls);
+                self.recall[area][m][t].push(r);
+                if most == MAX_DETECTIONS[2] {
+                    self.precision[area][t].extend(p);
                 }
             }
         }
     }
-    let mean = |values: &mut dyn Iterator<Item = &Vec<f64>>| {
-        let (mut sum, mut count) = (0.0, 0usize);
-        for list in values {
-            sum += list.iter().sum::<f64>();
-            count += list.len();
+
+    fn scores(&self) -> CocoScores {
+        let ap = |area: usize| mean(self.precision[area].iter());
+        let ar = |area: usize, most: usize| mean(self.recall[area][most].iter());
+        CocoScores {
+            ap: ap(0),
+            ap50: mean(self.precision[0].iter().take(1)),
+            ap75: mean(self.precision[0].iter().skip(5).take(1)),
+            ap_small: ap(1),
+            ap_medium: ap(2),
+            ap_large: ap(3),
+            ar1: ar(0, 0),
+            ar10: ar(0, 1),
+            ar100: ar(0, 2),
+            ar_small: ar(1, 2),
+            ar_medium: ar(2, 2),
+            ar_large: ar(3, 2),
         }
-        (count > 0).then(|| sum / count as f64)
-    };
-    let ap = |area: usize| mean(&mut precision[area].iter());
-    let ar = |area: usize, most: usize| mean(&mut recall[area][most].iter());
-    CocoScores {
-        ap: ap(0),
-        ap50: mean(&mut precision[0].iter().take(1)),
-        ap75: mean(&mut precision[0].iter().skip(5).take(1)),
-        ap_small: ap(1),
-        ap_medium: ap(2),
-        ap_large: ap(3),
-        ar1: ar(0, 0),
-        ar10: ar(0, 1),
-        ar100: ar(0, 2),
-        ar_small: ar(1, 2),
-        ar_medium: ar(2, 2),
-        ar_large: ar(3, 2),
     }
+}
+
+/// Mean of all numbers; `None` without any.
+fn mean<'a>(lists: impl Iterator<Item = &'a Vec<f64>>) -> Option<f64> {
+    let (mut sum, mut count) = (0.0, 0usize);
+    for list in lists {
+        sum += list.iter().sum::<f64>();
+        count += list.len();
+    }
+    (count > 0).then(|| sum / count as f64)
 }
 
 /// Overlap of every detection with every ground truth; with a crowd, of the detection's own area.
