@@ -9,15 +9,15 @@ use sixfold_geometry::{Pose, Vec2, Vec3, stats::median};
 
 use crate::lens::Lens;
 
-/// Residuals of this many standard deviations get half the weight.
+/// Residuals of this many standard deviations get half the weight. Chosen by hand; not swept.
 const CAUCHY: f64 = 2.0;
-/// Smallest standard deviation of a residual, pixels.
+/// Smallest standard deviation of a residual, pixels. Chosen by hand; not swept.
 const LEAST_DEVIATION: f64 = 1e-3;
-/// Number of parts of the sums.
+/// Number of parts of the sums. Chosen by hand; not swept.
 const PARTS: usize = 8;
-/// Residual of an observation behind its camera, pixels.
+/// Residual of an observation behind its camera, pixels. Chosen by hand; not swept.
 const BEHIND: f64 = 1e3;
-/// Convergence: the sum of costs changes by less than this fraction.
+/// Convergence: the sum of costs changes by less than this fraction. Chosen by hand; not swept.
 const DONE: f64 = 1e-7;
 
 /// An observation of a point in a photograph.

@@ -12,18 +12,19 @@ use crate::tracks::Track;
 use crate::triangulate::{triangulated, widest};
 
 /// Maximum number of pairs of photographs from which a point is triangulated to reject wrong observations.
+/// Chosen by hand; not swept.
 const PAIRS: usize = 15;
-/// Minimum fraction of the known points in a photograph that agree with its pose.
+/// Minimum fraction of the known points in a photograph that agree with its pose. Chosen by hand; not swept.
 const AGREEING: f64 = 0.2;
-/// The bundle is adjusted again when the number of photographs has grown by this factor.
+/// The bundle is adjusted again when the number of photographs has grown by this factor. Chosen by hand; not swept.
 const GROWTH: f64 = 1.15;
-/// Factor on the threshold while a photograph's pose is searched.
+/// Factor on the threshold while a photograph's pose is searched. Chosen by hand; not swept.
 const COARSE: f64 = 1.5;
 
 /// Lens parameters that may change: with few photographs, and with many.
 const FIRST: [usize; 2] = [0, 3];
 const ALL: [usize; 5] = [0, 1, 2, 3, 4];
-/// Minimum number of photographs to refine the lens at all, and in all parameters.
+/// Minimum number of photographs to refine the lens at all, and in all parameters. Chosen by hand; not swept.
 const ENOUGH: [usize; 2] = [4, 8];
 
 /// The current state.

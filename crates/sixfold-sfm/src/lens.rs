@@ -4,7 +4,7 @@ use sixfold_geometry::nalgebra::Vector5;
 use sixfold_geometry::{BrownConrady, Camera, Vec2, Vec3};
 
 /// Prior standard deviations of a guess: the focal length (fraction of it), the principal point (fraction of the longer side), and
-/// both radial coefficients.
+/// both radial coefficients. Chosen by hand; not swept.
 const BELIEF: [f64; 4] = [0.3, 0.02, 0.2, 0.3];
 
 /// A pixel with its derivatives by the point (2x3, by rows) and by the parameters (2x5).

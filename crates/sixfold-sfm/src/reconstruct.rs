@@ -15,13 +15,15 @@ use crate::tracks::{Track, joined};
 use crate::two_view::{TwoViews, two_views};
 
 /// Focal lengths that are tried if the camera is a guess, as fractions of the guess, and the number of pairs of photographs used.
+/// Chosen by hand; not swept.
 const FOCAL_LENGTHS: [f64; 7] = [0.6, 0.7, 0.82, 0.95, 1.1, 1.3, 1.55];
 const FOCAL_PAIRS: usize = 12;
-/// Maximum number of initial pairs that are tried.
+/// Maximum number of initial pairs that are tried. Chosen by hand; not swept.
 const BEGINNINGS: usize = 6;
-/// An initial pair that leads to this fraction of registered photographs is good enough.
+/// An initial pair that leads to this fraction of registered photographs is good enough. Chosen by hand; not swept.
 const GOOD: f64 = 0.95;
 /// Angle above which a larger one does not make a better initial pair, degrees; and the factor for planar pairs.
+/// Chosen by hand; not swept.
 const WIDE: f64 = 16.0;
 const PLANE: f64 = 0.6;
 

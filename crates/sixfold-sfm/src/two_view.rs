@@ -11,15 +11,16 @@ use crate::five_point::essential_matrices;
 use crate::homography::{motions, transfer};
 use crate::relative::{before_both, essential, motion_of, parallax, refined, sampson};
 
-/// Probability that at least one sample contains no wrong match.
+/// Probability that at least one sample contains no wrong match. Chosen by hand; not swept.
 const CONFIDENCE: f64 = 0.999;
 /// The matches count as planar if a homography holds for this fraction of those that agree with the motion.
+/// Chosen by hand; not swept.
 const PLANAR: f64 = 0.9;
-/// Samples of four matches for the homography.
+/// Samples of four matches for the homography. Chosen by hand; not swept.
 const PLANE_SAMPLES: usize = 100;
-/// Passes of refining the motion with the best matches.
+/// Passes of refining the motion with the best matches. Chosen by hand; not swept.
 const PASSES: usize = 3;
-/// Minimum fraction of the agreeing matches in front of both cameras.
+/// Minimum fraction of the agreeing matches in front of both cameras. Chosen by hand; not swept.
 const BEFORE: f64 = 0.7;
 
 /// The geometry of two photographs.

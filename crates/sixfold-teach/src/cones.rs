@@ -7,17 +7,17 @@ use crate::distance::signed_distance;
 use crate::grid::Grid;
 use crate::view::{Volume, bilinear};
 
-/// Voxels along the longest side.
+/// Voxels along the longest side. Chosen by hand; not swept.
 const CELLS: usize = 48;
-/// Fraction of the photographs showing a voxel that may vote that it is empty.
+/// Fraction of the photographs showing a voxel that may vote that it is empty. Chosen by hand; not swept.
 const DISSENT: f64 = 0.15;
-/// Tolerance for errors of a mask's border and of a pose, pixels.
+/// Tolerance for errors of a mask's border and of a pose, pixels. Chosen by hand; not swept.
 const MARGIN: f32 = 2.0;
-/// Size of the first box relative to the size of the masks: a mask may show only a part of the object.
+/// Size of the first box relative to the size of the masks: a mask may show only a part of the object. Chosen by hand; not swept.
 const FIRST: f64 = 2.0;
-/// Maximum number of times that the box is made larger or smaller.
+/// Maximum number of times that the box is made larger or smaller. Chosen by hand; not swept.
 const ROUNDS: usize = 6;
-/// Two rays that enclose a smaller angle do not determine an intersection, radians.
+/// Two rays that enclose a smaller angle do not determine an intersection, radians. Chosen by hand; not swept.
 const PARALLEL: f64 = 0.05;
 
 /// A photograph's mask with camera and pose.
