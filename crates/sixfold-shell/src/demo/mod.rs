@@ -9,12 +9,12 @@ mod colour_poses;
 mod colour_poses;
 mod samples;
 
-use std::collections::BTreeMap;
-use std::collections::btree_map::Entry;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::Result;
+use rayon::prelude::*;
 use serde::Serialize;
 use sixfold_align::{DepthOptions, DepthRegion};
 use sixfold_bop::{
@@ -129,7 +129,7 @@ impl Demo {
     }
 }
 
-/// The samples' objects; the features of each are computed when it is first needed.
+/// The samples' objects; the features of each are computed when an image first needs it.
 struct Samples<'a> {
     dataset: &'a BopDataset,
     infos: sixfold_mesh::ModelsInfo,
@@ -143,11 +143,18 @@ impl<'a> Samples<'a> {
         Ok(Samples { dataset, infos, folder, known: BTreeMap::new() })
     }
 
-    fn object(&mut self, id: u32) -> Result<&Known> {
-        Ok(match self.known.entry(id) {
-            Entry::Occupied(known) => known.into_mut(),
-            Entry::Vacant(place) => place.insert(Known::new(self.dataset, &self.infos, id, self.folder)?),
-        })
+    /// Prepares the objects of an image, several at a time.
+    fn prepare(&mut self, targets: &[&Target]) -> Result<()> {
+        let ids: BTreeSet<u32> = targets.iter().filter_map(|t| t.object).map(|o| o.obj_id).collect();
+        let missing: Vec<u32> = ids.into_iter().filter(|id| !self.known.contains_key(id)).collect();
+        let new = |&id: &u32| Ok((id, Known::new(self.dataset, &self.infos, id, self.folder)?));
+        let new: Vec<Result<_>> = missing.par_iter().map(new).collect();
+        for object in new {
+            let (id, (known, notes)) = object?;
+            notes.iter().for_each(|note| eprintln!("note: {note}"));
+            self.known.insert(id, known);
+        }
+        Ok(())
     }
 }
 
@@ -174,11 +181,12 @@ impl FromDepth {
         let camera = scene.camera(im_id)?;
         let Some(depth) = scene.depth(im_id)? else { return Ok(()) };
         let prepared = DepthRegion::from_depth(&depth, &camera, None, &DepthOptions::default())?;
+        samples.prepare(targets)?;
         let mut found = vec![];
         for object in targets.iter().filter_map(|t| t.object) {
             let id = object.obj_id;
+            let Some(known) = samples.known.get(&id) else { continue };
             let began = Instant::now();
-            let known = samples.object(id)?;
             let estimates = estimate(&prepared, &known.model, &PpfOptions::default());
             let seconds = began.elapsed().as_secs_f64();
             progress.step(format!("image {im_id}, object {id}"));

@@ -19,8 +19,13 @@ pub(super) struct Known {
 }
 
 impl Known {
-    /// Object `id`; its prepared data is kept in `folder`.
-    pub(super) fn new(dataset: &BopDataset, infos: &ModelsInfo, id: u32, folder: &Path) -> Result<Known> {
+    /// Object `id`, and notes for the user; its prepared data is kept in `folder`.
+    pub(super) fn new(
+        dataset: &BopDataset,
+        infos: &ModelsInfo,
+        id: u32,
+        folder: &Path,
+    ) -> Result<(Known, Vec<String>)> {
         let mesh = dataset.model(id, Models::Rendering)?;
         let points = ModelPoints::new(mesh.vertices())
             .ok_or_else(|| anyhow!("object {id}: the model has no vertices"))?;
@@ -30,9 +35,9 @@ impl Known {
         let object = Object::of_mesh(format!("object {id}"), mesh, info.clone());
         let object = Object { id: Some(id), folder: Some(folder), ..object };
         let prepared = PpfEstimator::default().prepare(&object)?;
-        prepared.notes().iter().for_each(|note| eprintln!("note: {note}"));
+        let notes = prepared.notes().to_vec();
         let model = downcast::<PpfObject>(prepared.as_ref(), "ppf")?.model().clone();
-        Ok(Known { object, info, model, points })
+        Ok((Known { object, info, model, points }, notes))
     }
 
     /// Its surface.
