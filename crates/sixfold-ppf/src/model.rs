@@ -156,6 +156,8 @@ pub(crate) struct FeatureTable {
     pub distance_step: f32,
     pub distance_steps: usize,
     pub angle_steps: usize,
+    /// For each row the rotations at which it casts no vote, one bit each: all of them for a row without entries, otherwise none.
+    pub silent: Vec<u32>,
     /// Blocks in a row.
     pub blocks: usize,
     /// Start of each block of each row in `entries`, and the end.
@@ -167,11 +169,6 @@ pub(crate) struct FeatureTable {
 }
 
 impl FeatureTable {
-    /// Number of rows, empty ones included.
-    pub(crate) fn rows(&self) -> usize {
-        self.starts.len() / self.blocks
-    }
-
     /// Number of the feature's row.
     #[inline]
     pub(crate) fn row(&self, distance: usize, angles: [usize; 3]) -> usize {
@@ -384,6 +381,7 @@ fn build_table(
         distance_step: step as f32,
         distance_steps,
         angle_steps,
+        silent: vec![],
         blocks,
         starts: vec![0; distance_steps * angle_steps.pow(3) * blocks + 1],
         entries: vec![],
@@ -415,6 +413,8 @@ fn build_table(
     for i in 1..table.starts.len() {
         table.starts[i] += table.starts[i - 1];
     }
+    let of_row = |row: &[u32]| if row[0] == row[blocks] { u32::MAX } else { 0 };
+    table.silent = table.starts.windows(blocks + 1).step_by(blocks).map(of_row).collect();
     let mut next = table.starts.clone();
     table.entries = vec![0; pairs.iter().map(Vec::len).sum()];
     for (block, entry) in pairs.into_iter().flatten() {

@@ -223,7 +223,7 @@ struct Peak {
 struct Counter {
     /// Votes per model point of a block and rotation.
     votes: Box<[u16; BLOCK * TURNS]>,
-    /// Per feature row, the rotations that have voted, one bit each.
+    /// Per feature row, the rotations that have voted, one bit each; all bits for a row without entries.
     voted: Vec<u32>,
     touched: Vec<u32>,
     row_votes: Vec<RowVote>,
@@ -233,7 +233,7 @@ impl Counter {
     fn new(table: &FeatureTable) -> Counter {
         Counter {
             votes: Box::new([0; BLOCK * TURNS]),
-            voted: vec![0; table.rows()],
+            voted: table.silent.clone(),
             touched: vec![],
             row_votes: vec![],
         }
@@ -288,22 +288,21 @@ impl Counter {
                     for c in 0..counts[2] {
                         for e in 0..counts[3] {
                             let row = table.row(bins[0][a], [bins[1][b], bins[2][c], bins[3][e]]);
-                            let first = row * table.blocks;
-                            if table.starts[first] == table.starts[first + table.blocks]
-                                || voted[row] & bit != 0
-                            {
+                            if voted[row] & bit != 0 {
                                 continue;
                             }
                             if voted[row] == 0 {
                                 touched.push(row as u32);
                             }
                             voted[row] |= bit;
-                            row_votes.push(RowVote { first: first as u32, turn });
+                            row_votes.push(RowVote { first: (row * table.blocks) as u32, turn });
                         }
                     }
                 }
             }
         });
+        // In the order of the table, for the cache.
+        row_votes.sort_unstable_by_key(|vote| vote.first);
     }
 
     /// Counts the votes for the model points of one block. They fit 16 bits: an entry votes at most twice for a slot, and a model point
