@@ -108,14 +108,13 @@ impl AnchoredConfig {
         }
     }
 
-    /// EfficientNet-Lite0 with a pyramid of half as many channels, and half as many numbers in the box head: an eighth of the
-    /// operations, for training on a CPU.
+    /// EfficientNet-Lite0 with a pyramid of a quarter of the channels and a box head of half as many numbers, to be trained on a CPU.
     pub fn compact(kind: AnchoredKind, labels: usize) -> Self {
         AnchoredConfig {
             encoder: EncoderKind::Lite0,
             blocks: [0; 4],
             width: 0,
-            pyramid: 128,
+            pyramid: 64,
             hidden: if kind == AnchoredKind::RetinaNet { 0 } else { 512 },
             ..AnchoredConfig::new(kind, labels)
         }

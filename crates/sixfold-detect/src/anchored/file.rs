@@ -162,7 +162,7 @@ mod tests {
         let error = before.iter().zip(&after).fold(0f32, |m, (a, b)| m.max((a - b).abs()));
         // Files hold half floats.
         assert!(largest > 0.1 && error < 0.01 * largest, "{error} of {largest}");
-        let resnet = AnchoredConfig { pyramid: 128, hidden: 512, ..AnchoredConfig::new(kind, 3) };
+        let resnet = AnchoredConfig { pyramid: 64, hidden: 512, ..AnchoredConfig::new(kind, 3) };
         let error = AnchoredNetwork::load(&path, &resnet, &device).unwrap_err().to_string();
         assert!(error.contains("model.safetensors") && error.contains("tensor"), "{error}");
     }

@@ -157,10 +157,10 @@ mod tests {
         };
         for kind in [AnchoredKind::FasterRcnn, AnchoredKind::MaskRcnn, AnchoredKind::RetinaNet] {
             let lite0 = shapes(&AnchoredConfig::compact(kind, 3));
-            let first = if kind == AnchoredKind::RetinaNet { [1, 128, 12, 20] } else { [1, 128, 24, 40] };
+            let first = if kind == AnchoredKind::RetinaNet { [1, 64, 12, 20] } else { [1, 64, 24, 40] };
             assert_eq!(lite0[0], first);
             let resnet = AnchoredConfig { blocks: [1; 4], width: 4, ..AnchoredConfig::new(kind, 3) };
-            assert_eq!(lite0, shapes(&AnchoredConfig { pyramid: 128, ..resnet }));
+            assert_eq!(lite0, shapes(&AnchoredConfig { pyramid: 64, ..resnet }));
         }
     }
 }
