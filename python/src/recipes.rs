@@ -105,7 +105,7 @@ pub(crate) fn train_pix2pose<'py>(
 ///
 /// material, out, ids, frames, split, renders_only, init, backgrounds, progress, Ctrl-C and going on: as train_pix2pose.
 /// network: "compact", "retinanet" (without anchors), or the dissertation's "faster-rcnn", "mask-rcnn" and "retinanet-anchors", which need
-/// encoder: torchvision's weights of ResNet-50 or of the same network; batch: images in a step; encoder_share: the pretrained encoder's
+/// backbone="lite0" (EfficientNet-Lite0) or encoder: torchvision's weights of ResNet-50 or of the same network; batch: images in a step; encoder_share: the pretrained encoder's
 /// fraction of the learning rate; size: side of the training images in pixels, a multiple of 32; photograph_share: fraction of
 /// training images that are parts of photographs; render_share: fraction of renders among pasted objects; rotation: largest rotation
 /// in the image plane, radians, 15 degrees if None; longest_side: larger images are reduced to so many pixels before detection; threshold: score
@@ -116,7 +116,7 @@ pub(crate) fn train_pix2pose<'py>(
 /// >>> trained = train_detector("data/demo", "out/detector", steps=200)  # doctest: +SKIP
 /// >>> detector = Detector.load(trained["model"])  # doctest: +SKIP
 #[pyfunction]
-#[pyo3(signature = (material, out, *, ids=None, frames=None, split=None, renders_only=false, network=None, steps=None, batch=None, learning_rate=None, encoder_share=None, frozen_stages=None, size=None, photograph_share=None, render_share=None, rotation=None, longest_side=None, threshold=None, init=None, encoder=None, backgrounds=None, mesh_colors=None, progress=None, seed=None))]
+#[pyo3(signature = (material, out, *, ids=None, frames=None, split=None, renders_only=false, network=None, backbone=None, steps=None, batch=None, learning_rate=None, encoder_share=None, frozen_stages=None, size=None, photograph_share=None, render_share=None, rotation=None, longest_side=None, threshold=None, init=None, encoder=None, backgrounds=None, mesh_colors=None, progress=None, seed=None))]
 #[allow(clippy::too_many_arguments)]
 pub(crate) fn train_detector<'py>(
     py: Python<'py>,
@@ -127,6 +127,7 @@ pub(crate) fn train_detector<'py>(
     split: Option<String>,
     renders_only: bool,
     network: Option<&str>,
+    backbone: Option<&str>,
     steps: Option<i64>,
     batch: Option<i64>,
     learning_rate: Option<f64>,
@@ -145,10 +146,12 @@ pub(crate) fn train_detector<'py>(
     progress: Option<Py<PyAny>>,
     seed: Option<i64>,
 ) -> PyResult<Bound<'py, PyDict>> {
+    use sixfold::detect::network::EncoderKind;
     use sixfold::detect::recipe::{DetectorRecipe, MIN_VISIBILITY};
     let default = DetectorRecipe::default();
     let recipe = checked(DetectorRecipe {
         network: choice("network", network, default.network)?,
+        backbone: backbone.map(|name| choice("backbone", Some(name), EncoderKind::Lite0)).transpose()?,
         steps: self::steps(steps)?.unwrap_or(default.steps),
         batch: count("batch", batch, default.batch)?,
         learning_rate: learning_rate.unwrap_or(default.learning_rate),

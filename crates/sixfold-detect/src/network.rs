@@ -9,6 +9,7 @@ use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 use serde::{Deserialize, Serialize};
 use sixfold_geometry::random::stream;
+use sixfold_nn::choice::Choice;
 use sixfold_nn::kernels::Activation;
 use sixfold_nn::layers::{Conv, ConvConfig, Padding};
 use sixfold_nn::lite0::{Lite0, Lite0Config};
@@ -30,6 +31,33 @@ pub enum EncoderKind {
     Lite0,
     /// ResNet-50.
     ResNet50,
+}
+
+impl Choice for EncoderKind {
+    const ALL: &'static [EncoderKind] = &[EncoderKind::Lite0, EncoderKind::ResNet50];
+
+    fn name(self) -> &'static str {
+        match self {
+            EncoderKind::Lite0 => "lite0",
+            EncoderKind::ResNet50 => "resnet50",
+        }
+    }
+
+    fn help(self) -> &'static str {
+        match self {
+            EncoderKind::Lite0 => "EfficientNet-Lite0, whose ImageNet weights are part of the program",
+            EncoderKind::ResNet50 => "ResNet-50, with torchvision's weights from --encoder",
+        }
+    }
+}
+
+/// Channels of [`lite0_maps`].
+pub(crate) const LITE0_CHANNELS: [usize; 3] = [24, 40, 112];
+
+/// EfficientNet-Lite0's maps at 1/4, 1/8 and 1/16 of the resolution.
+pub(crate) fn lite0_maps(network: &Lite0, x: Tensor<4>) -> Vec<Tensor<4>> {
+    let maps = network.forward(x);
+    vec![maps[1].clone(), maps[2].clone(), maps[4].clone()]
 }
 
 /// Sizes of a detector; part of its weight file.
@@ -113,7 +141,7 @@ impl DetectorConfig {
     /// If the encoder is not of the configured kind.
     pub fn init_with(&self, encoder: Encoder, seed: u64, device: &Device) -> Detector {
         let channels: &[usize] = match encoder {
-            Encoder::Lite0(_) => &[24, 40, 112],
+            Encoder::Lite0(_) => &LITE0_CHANNELS,
             Encoder::ResNet50(_) => &[256, 512, 1024, 2048],
         };
         assert_eq!(matches!(encoder, Encoder::Lite0(_)), self.encoder == EncoderKind::Lite0);
@@ -183,10 +211,7 @@ impl Encoder {
     /// Maps at 1/4, 1/8, 1/16 (and 1/32) of the resolution.
     pub fn maps(&self, x: Tensor<4>) -> Vec<Tensor<4>> {
         match self {
-            Encoder::Lite0(network) => {
-                let maps = network.forward(x);
-                vec![maps[1].clone(), maps[2].clone(), maps[4].clone()]
-            }
+            Encoder::Lite0(network) => lite0_maps(network, x),
             Encoder::ResNet50(network) => network.features(x).split_off(1),
         }
     }

@@ -5,6 +5,7 @@ use std::f32::consts::PI;
 use std::path::PathBuf;
 
 use burn::tensor::Device;
+use serde_json::json;
 use sixfold_data::{PosedImage, TrainingSet, background_files, plain_backgrounds};
 use sixfold_nn::choice::Choice;
 use sixfold_nn::fingerprint::Fingerprint;
@@ -17,7 +18,7 @@ use sixfold_nn::weights::{ModelCard, training_frames};
 
 use crate::anchored::{AnchoredConfig, AnchoredKind, AnchoredNetwork, AnchoredTraining};
 use crate::model::{ClassEntry, DetectorModel, DetectorUse};
-use crate::network::{Detector, DetectorConfig, Encoder};
+use crate::network::{Detector, DetectorConfig, Encoder, EncoderKind};
 use crate::samples::{TrainingImageError, TrainingImageOptions, TrainingImageSource};
 use crate::training::{AnyTraining, DetectorTraining, DetectorTrainingOptions};
 
@@ -29,7 +30,7 @@ pub enum DetectorKind {
     Compact,
     /// ResNet-50 with RetinaNet's pyramid and towers. There are no anchors, unlike in the dissertation.
     Retinanet,
-    /// The dissertation's detectors, trained from torchvision's pretrained weights.
+    /// The dissertation's detectors, from pretrained weights of torchvision or on EfficientNet-Lite0.
     Anchored(AnchoredKind),
 }
 
@@ -66,7 +67,9 @@ impl Choice for DetectorKind {
 pub struct DetectorRecipe {
     /// Which network is trained.
     pub network: DetectorKind,
-    /// Number of steps.
+    /// The encoder under the pyramid of [`DetectorKind::Anchored`]; without, ResNet-50, or that of `init`. The other networks have one each.
+    pub backbone: Option<EncoderKind>,
+    /// Steps in all.
     pub steps: u64,
     /// Images in a step.
     pub batch: usize,
@@ -76,8 +79,8 @@ pub struct DetectorRecipe {
     pub encoder_share: f64,
     /// Number of frozen stages of the ImageNet encoder, of five.
     pub frozen_stages: usize,
-    /// torchvision's ResNet-50 weights for [`DetectorKind::Retinanet`]; random ones if `None`. For [`DetectorKind::Anchored`] it is
-    /// required: these, or torchvision's weights of the same network.
+    /// torchvision's ResNet-50 weights for [`DetectorKind::Retinanet`]; random ones without. For [`DetectorKind::Anchored`] on ResNet-50,
+    /// which needs it, these or torchvision's weights of the same network.
     pub encoder: Option<PathBuf>,
     /// Side of the training images in pixels, a multiple of 32 (RetinaNet: 128).
     pub size: usize,
@@ -110,6 +113,7 @@ impl Default for DetectorRecipe {
         let samples = TrainingImageOptions::default();
         DetectorRecipe {
             network: DetectorKind::Compact,
+            backbone: None,
             steps: common.steps,
             batch,
             learning_rate: common.learning_rate,
@@ -206,13 +210,24 @@ impl DetectorRecipe {
         device: &Device,
     ) -> Result<AnchoredNetwork, TrainError> {
         if let Some(file) = &self.init {
-            return DetectorModel::anchored_for_training(file, kind, ids, device).map_err(TrainError::method);
+            let network = DetectorModel::anchored_for_training(file, kind, ids, device);
+            let network = network.map_err(TrainError::method)?;
+            let (asked, its) = (self.backbone, network.config().encoder);
+            if let Some(asked) = asked.filter(|asked| *asked != its) {
+                let found = format!("{} for weights on {} in {}", asked.name(), its.name(), file.display());
+                let expected = "the backbone of the weights that the training continues from";
+                return Err(OptionError { field: "backbone", found, expected }.into());
+            }
+            return Ok(network);
+        }
+        // The R-CNNs know a background beside the objects.
+        let labels = ids.len() + AnchoredConfig::new(kind, 1).first_label();
+        if self.backbone == Some(EncoderKind::Lite0) {
+            return Ok(AnchoredNetwork::on_lite0(kind, labels, self.seed, device)?);
         }
         let expected = "torchvision's weights of ResNet-50 or of the same network";
         let wrong = |found: String| OptionError { field: "encoder", found, expected };
         let file = self.encoder.as_deref().ok_or_else(|| wrong("none".to_owned()))?;
-        // The R-CNNs have a background class in addition to the objects.
-        let labels = ids.len() + AnchoredConfig::new(kind, 1).first_label();
         let network = AnchoredNetwork::pretrained(file, kind, labels, self.seed, device);
         let network = network.map_err(TrainError::method)?;
         Ok(network.ok_or_else(|| wrong(format!("weights of another network in {}", file.display())))?)
@@ -248,9 +263,18 @@ impl Recipe for DetectorRecipe {
         let expected = "network retinanet; the compact network brings its ImageNet encoder along";
         OptionError::unless(!wrong, "encoder", "one for the compact network", expected)?;
         let anchored = matches!(self.network, DetectorKind::Anchored(_));
-        let start = !anchored || self.encoder.is_some() || self.init.is_some();
-        let expected =
-            "torchvision's weights of ResNet-50 or of the same network, or weights to continue from";
+        let lite0 = self.backbone == Some(EncoderKind::Lite0);
+        if let Some(backbone) = self.backbone {
+            let found = format!("{} with network {}", backbone.name(), self.network.name());
+            let expected =
+                "none; the networks compact (lite0) and retinanet (resnet50) have one backbone each";
+            OptionError::unless(anchored, "backbone", found, expected)?;
+        }
+        let wrong = anchored && lite0 && self.encoder.is_some();
+        let expected = "none; the backbone lite0 brings its ImageNet weights along";
+        OptionError::unless(!wrong, "encoder", "a file with backbone lite0", expected)?;
+        let start = !anchored || lite0 || self.encoder.is_some() || self.init.is_some();
+        let expected = "torchvision's weights of ResNet-50 or of the same network, weights to continue from, or backbone lite0";
         OptionError::unless(start, "encoder", "none", expected)?;
         if let Err(TrainingImageError::Option { field, found, expected }) = self.scenes().check() {
             return Err(OptionError { field, found, expected });
@@ -263,8 +287,8 @@ impl Recipe for DetectorRecipe {
         // Every field by name, so that the compiler reports a new one.
         #[rustfmt::skip]
         let DetectorRecipe {
-            network, encoder, init, backgrounds,
-            // These are in the options of training and samples.
+            network, backbone, encoder, init, backgrounds,
+            // In the options of training and samples.
             steps: _, batch: _, learning_rate: _, encoder_share: _, frozen_stages: _, size: _, photograph_share: _,
             render_share: _, rotation: _, mesh_colors: _, seed: _,
             // These do not affect the training.
@@ -272,8 +296,9 @@ impl Recipe for DetectorRecipe {
         } = self;
         let backgrounds = background_files(backgrounds.as_deref()).map_err(TrainError::method)?;
         Fingerprint::of(&self.options())?
-            .merged(&Fingerprint::of(&serde_json::json!({ "samples": self.scenes() }))?)
+            .merged(&Fingerprint::of(&json!({ "samples": self.scenes() }))?)
             .with("network", network.name())
+            .merged(&Fingerprint::of(&backbone.map(|b| json!({ "backbone": b })).unwrap_or(json!({})))?)
             .with_contents(material.contents())
             .with_file("encoder", encoder.as_deref())?
             .with_file("init", init.as_deref())?
@@ -292,7 +317,7 @@ impl Recipe for DetectorRecipe {
         card.data.clone_from(&material.description);
         card.training_frames =
             training_frames(self.init.as_deref(), &material.frames).map_err(TrainError::method)?;
-        card.extra = serde_json::json!({
+        card.extra = json!({
             "training": options, "continued_from": continued_from(self.init.as_deref())?
         });
         let training = match self.network {

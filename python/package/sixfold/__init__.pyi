@@ -890,6 +890,7 @@ def train_detector(
     split: str | None = None,
     renders_only: bool = False,
     network: Literal["compact", "retinanet", "faster-rcnn", "mask-rcnn", "retinanet-anchors"] = "compact",
+    backbone: Literal["lite0", "resnet50"] | None = None,
     steps: int = 8000,
     batch: int = 4,
     learning_rate: float = 0.002,

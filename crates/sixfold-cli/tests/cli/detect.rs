@@ -286,3 +286,32 @@ fn detectors_with_anchors_are_trained_and_used() {
         format!("{train} --network mask-rcnn --encoder faster-rcnn.safetensors --steps 1 --out wrong");
     fails(tiny.path(), &wrong, &["--encoder", "weights of another network"]);
 }
+
+#[test]
+fn detectors_with_anchors_are_trained_on_lite0() {
+    let tiny = Tiny::coloured();
+    let train = "train detector --dataset tiny --ids 1 --size 96 --batch 1 --longest-side 96 --json";
+    for network in ["faster-rcnn", "mask-rcnn", "retinanet-anchors"] {
+        let of = format!("{train} --network {network} --backbone lite0 --out {network}");
+        let trained = sixfold(tiny.path(), &format!("{of} --steps 2")).expect(0).json();
+        assert!(trained["losses"]["boxes"].as_f64().is_some_and(f64::is_finite), "{trained}");
+        let card = std::fs::read_to_string(tiny.path().join(network).join("model.md")).unwrap();
+        assert!(card.contains(&format!("detect-{network}")) && card.contains("\"lite0\""), "{card}");
+        let rgb = "--rgb tiny/test/000007/rgb/000004.png --threshold 0.0001";
+        let run = sixfold(tiny.path(), &format!("detect --weights {network}/model.safetensors {rgb} --json"));
+        assert!(run.expect(0).json()["detections"].as_array().is_some_and(|found| !found.is_empty()));
+        let other = format!("{train} --network {network} --steps 1 --init {network}/model.safetensors");
+        fails(
+            tiny.path(),
+            &format!("{other} --backbone resnet50 --out other"),
+            &["--backbone", "resnet50 for weights on lite0"],
+        );
+        sixfold(tiny.path(), &format!("{other} --out more-{network}")).expect(0);
+        fails(tiny.path(), &format!("{of} --steps 2 --encoder a.pth"), &["--encoder", "lite0"]);
+    }
+    fails(
+        tiny.path(),
+        &format!("{train} --network compact --backbone resnet50 --out no"),
+        &["--backbone", "resnet50 with network compact"],
+    );
+}

@@ -4,6 +4,8 @@ use serde::{Deserialize, Serialize};
 use sixfold_nn::choice::Choice;
 use sixfold_nn::resnet::Bottlenecks;
 
+use crate::network::EncoderKind;
+
 /// The three networks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -30,9 +32,9 @@ impl Choice for AnchoredKind {
 
     fn help(self) -> &'static str {
         match self {
-            AnchoredKind::FasterRcnn => "Faster R-CNN on ResNet-50 with a feature pyramid",
-            AnchoredKind::MaskRcnn => "Mask R-CNN on ResNet-50 with a feature pyramid",
-            AnchoredKind::RetinaNet => "RetinaNet with anchors on ResNet-50 with a feature pyramid",
+            AnchoredKind::FasterRcnn => "Faster R-CNN with a feature pyramid",
+            AnchoredKind::MaskRcnn => "Mask R-CNN with a feature pyramid",
+            AnchoredKind::RetinaNet => "RetinaNet with anchors and a feature pyramid",
         }
     }
 }
@@ -45,13 +47,16 @@ pub struct AnchoredConfig {
     /// Labels that the network tells apart: torchvision's `num_classes`. Label 0 is the background of the R-CNNs, and of
     /// RetinaNet a label as any other (its COCO weights never use it).
     pub labels: usize,
-    /// Bottlenecks in the layers of the ResNet.
+    /// What the pyramid stands on. Files without this field have a ResNet.
+    #[serde(default = "resnet", skip_serializing_if = "is_resnet")]
+    pub encoder: EncoderKind,
+    /// Bottlenecks in the layers of the ResNet; 0 without one.
     pub blocks: [usize; 4],
-    /// Channels of the ResNet's first convolution.
+    /// Channels of the ResNet's first convolution; 0 without one.
     pub width: usize,
     /// Channels of the pyramid and of the heads' convolutions.
     pub pyramid: usize,
-    /// Numbers in the two layers of the box head.
+    /// Numbers in the two layers of the box head, which RetinaNet does not have.
     pub hidden: usize,
     /// Added to the variances of the ResNet's normalisations. torchvision's is 1e-5, but 0 for frozen normalisations of networks built
     /// with its COCO_V1 weights (`overwrite_eps`). No weight file states it; those of normalisations that are not frozen, which count
@@ -61,6 +66,15 @@ pub struct AnchoredConfig {
     pub min_side: usize,
     /// Unless the longer side would exceed this, pixels (torchvision: 1333).
     pub max_side: usize,
+}
+
+fn resnet() -> EncoderKind {
+    EncoderKind::ResNet50
+}
+
+#[allow(clippy::trivially_copy_pass_by_ref)]
+fn is_resnet(encoder: &EncoderKind) -> bool {
+    *encoder == EncoderKind::ResNet50
 }
 
 /// Which detections are kept.
@@ -83,6 +97,7 @@ impl AnchoredConfig {
         AnchoredConfig {
             kind,
             labels,
+            encoder: EncoderKind::ResNet50,
             blocks,
             width,
             pyramid: 256,
@@ -90,6 +105,18 @@ impl AnchoredConfig {
             norm_epsilon: epsilon,
             min_side: 800,
             max_side: 1333,
+        }
+    }
+
+    /// EfficientNet-Lite0 with a pyramid of a quarter of the channels and a box head of half as many numbers, to be trained on a CPU.
+    pub fn compact(kind: AnchoredKind, labels: usize) -> Self {
+        AnchoredConfig {
+            encoder: EncoderKind::Lite0,
+            blocks: [0; 4],
+            width: 0,
+            pyramid: 64,
+            hidden: if kind == AnchoredKind::RetinaNet { 0 } else { 512 },
+            ..AnchoredConfig::new(kind, labels)
         }
     }
 

@@ -1,6 +1,7 @@
 //! Faster R-CNN (Ren et al. 2015), Mask R-CNN (He et al. 2017) and RetinaNet (Lin et al. 2017, "Focal loss") on a ResNet
 //! with a feature pyramid (Lin et al. 2017), as torchvision has them: its names of tensors, its constants and its
-//! order of steps, so that its weights give its detections.
+//! order of steps, so that its weights give its detections. The same on EfficientNet-Lite0 instead of the ResNet, to be trained
+//! without a graphics processor ([`AnchoredConfig::compact`]).
 //!
 //! The short way: [`AnchoredNetwork::from_pytorch`], [`AnchoredNetwork::detect`].
 

@@ -3,10 +3,10 @@
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use sixfold_geometry::RgbImage;
-use sixfold_nn::resnet::ResNet50;
 
 use super::config::{AnchoredConfig, AnchoredKind, Thresholds};
 use super::faster::FasterRcnn;
+use super::fpn::Backbone;
 use super::masks::MaskProbabilities;
 use super::retina::RetinaNet;
 use super::transform::Input;
@@ -39,25 +39,24 @@ pub(super) enum Layers {
 sixfold_nn::displayed_by_name!(Layers);
 
 impl Layers {
-    /// The ResNet, which is pretrained.
-    pub(super) fn body(&self) -> &ResNet50 {
+    pub(super) fn backbone(&self) -> &Backbone {
         match self {
-            Layers::TwoStages(network) => &network.backbone.body,
-            Layers::OneStage(network) => &network.backbone.body,
+            Layers::TwoStages(network) => &network.backbone,
+            Layers::OneStage(network) => &network.backbone,
         }
     }
 
-    pub(super) fn body_mut(&mut self) -> &mut ResNet50 {
+    pub(super) fn backbone_mut(&mut self) -> &mut Backbone {
         match self {
-            Layers::TwoStages(network) => &mut network.backbone.body,
-            Layers::OneStage(network) => &mut network.backbone.body,
+            Layers::TwoStages(network) => &mut network.backbone,
+            Layers::OneStage(network) => &mut network.backbone,
         }
     }
 
-    /// The normalisations and the first stages of the ResNet stay as they are in a training.
+    /// [`Backbone::freeze_stages`].
     pub(super) fn freeze_stages(mut self, stages: usize) -> Layers {
-        let body = self.body().clone().freeze_stages(stages);
-        *self.body_mut() = body;
+        let backbone = self.backbone().clone().freeze_stages(stages);
+        *self.backbone_mut() = backbone;
         self
     }
 }

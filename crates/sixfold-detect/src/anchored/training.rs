@@ -1,5 +1,5 @@
 //! The training of Faster R-CNN, Mask R-CNN and RetinaNet: image after image through the network, gradients summed over a batch,
-//! AdamW. The constants are torchvision's; its normalisations are frozen, too.
+//! AdamW. The constants are torchvision's, but for EfficientNet-Lite0's number of proposals; its normalisations are frozen, too.
 
 use std::sync::Arc;
 
@@ -26,6 +26,7 @@ use super::matching::{Limits, Match, balanced, matches};
 use super::network::{AnchoredNetwork, Layers, normalise, vector};
 use super::retina::RetinaNet;
 use super::rpn::{LevelOutput, Most, proposals};
+use crate::network::EncoderKind;
 use crate::samples::{TrainingImageOptions, TrainingImageSource};
 use crate::targets::{Annotation, IGNORED};
 use crate::training::DetectorTrainingOptions;
@@ -40,6 +41,9 @@ const ANCHORS: (usize, f64) = (256, 0.5);
 /// Proposals of an image that the heads learn from, and the most that stand for objects (Lin et al. 2017, "Feature pyramid networks",
 /// section 5.2; torchvision).
 const PROPOSALS: (usize, f64) = (512, 0.25);
+/// The same with EfficientNet-Lite0, as many as Fast R-CNN learns from in a step of two images (Girshick 2015, section 2.3): they
+/// would cost more than all the rest.
+const PROPOSALS_LITE0: (usize, f64) = (128, 0.25);
 /// Images' random numbers, apart from those that make them.
 const SAMPLING: u64 = 0xa4c4_0000;
 
@@ -65,10 +69,10 @@ pub struct AnchoredTraining {
 /// Names of the losses, those of an image without masks or proposals 0.
 const NAMES: [&str; 5] = ["scores", "boxes", "masks", "proposal_scores", "proposal_boxes"];
 
-/// Losses of one image in the order of [`NAMES`], gradients of the ResNet and of the rest.
+/// Losses of one image in the order of [`NAMES`], gradients of the encoder and of the rest.
 struct ImageGradients {
     terms: [f64; 5],
-    body: GradientsParams,
+    encoder: GradientsParams,
     rest: GradientsParams,
 }
 
@@ -161,7 +165,8 @@ fn faster(
     let mut proposed = propose(network, &maps, image, &boxes, random, sum);
     proposed.extend(&boxes);
     let found = matched(&image.annotation, &boxes, &proposed, OF_HEADS);
-    let chosen = balanced(&found, PROPOSALS.0, PROPOSALS.1, random);
+    let (most, of_objects) = if network.backbone.lite0.is_some() { PROPOSALS_LITE0 } else { PROPOSALS };
+    let chosen = balanced(&found, most, of_objects, random);
     if chosen.is_empty() {
         return;
     }
@@ -267,9 +272,9 @@ impl AnchoredTraining {
         }
         let Some(product) = sum.product else { unreachable!("a detector has levels") };
         let mut gradients = product.div_scalar(images as f64).backward();
-        let body = gradients_of(&mut gradients, network.body());
+        let encoder = gradients_of(&mut gradients, &network.backbone().encoder());
         let rest = gradients_of(&mut gradients, network);
-        ImageGradients { terms: sum.terms.map(|term| term / images as f64), body, rest }
+        ImageGradients { terms: sum.terms.map(|term| term / images as f64), encoder, rest }
     }
 }
 
@@ -304,12 +309,13 @@ impl Training for AnchoredTraining {
 
     fn batches<'a>(&self, source: &'a TrainingImageSource) -> Batches<'a, Self::Batch> {
         let (batch, seed) = (self.options.batch as u64, self.options.common.seed);
+        let encoder = self.config.encoder;
         Box::new(move |step| {
             let image = |i: u64| {
                 let number = step * batch + i;
                 let sample = source.sample(seed, number);
                 let mut input = sample.rgb;
-                normalise(&mut input);
+                normalise(&mut input, encoder);
                 AnchoredImage { input, annotation: sample.annotation, number }
             };
             (0..batch).map(image).collect()
@@ -338,17 +344,25 @@ impl Training for AnchoredTraining {
             workers.into_iter().map(join).collect()
         });
         // Summed in the order of the images, whichever thread had them.
-        let (mut of_body, mut of_rest) = (GradientSum::new(), GradientSum::new());
+        let (mut of_encoder, mut of_rest) = (GradientSum::new(), GradientSum::new());
+        let encoder = network.backbone().encoder();
         let mut sums = [0.0; 5];
         let mut parts: Vec<_> = parts.into_iter().map(Vec::into_iter).collect();
         for image in 0..images.len() {
             let Some(part) = parts[image % threads].next() else { continue };
             sums.iter_mut().zip(part.terms).for_each(|(sum, term)| *sum += term);
-            of_body.add(network.body(), part.body);
+            of_encoder.add(&encoder, part.encoder);
             of_rest.add(network, part.rest);
         }
-        let body_rate = rate * self.options.encoder_share;
-        self.learner.step_part(body_rate, of_body.into_gradients(), Layers::body_mut);
+        let (encoder_rate, gradients) = (rate * self.options.encoder_share, of_encoder.into_gradients());
+        match self.config.encoder {
+            EncoderKind::ResNet50 => {
+                self.learner.step_part(encoder_rate, gradients, |network| &mut network.backbone_mut().body);
+            }
+            EncoderKind::Lite0 => {
+                self.learner.step_part(encoder_rate, gradients, |network| &mut network.backbone_mut().lite0);
+            }
+        }
         self.learner.step(rate, of_rest.into_gradients());
         NAMES.iter().zip(sums).map(|(name, value)| ((*name).to_string(), value)).collect()
     }
@@ -386,7 +400,7 @@ mod tests {
         let value = |c: usize, x: usize, y: usize| ((3 * x + 5 * y * (c + 1)) ^ (x * y / 16)) % 256;
         let pixels = (0..3 * 96 * 96).map(|i| value(i / (96 * 96), i % 96, i / 96 % 96) as f32 / 255.0);
         let mut input: Vec<f32> = pixels.collect();
-        normalise(&mut input);
+        normalise(&mut input, EncoderKind::ResNet50);
         let instance = |class, corners| Instance { class, corners };
         let instances = vec![instance(1, [10.0, 12.0, 49.0, 40.0]), instance(3, [60.0, 20.0, 90.0, 89.0])];
         let annotation = Annotation { size: [96, 96], labels: vec![0; 96 * 96], instances };

@@ -1,18 +1,29 @@
-//! An image as the networks want it: torchvision's mean and deviation, the shorter side at one length, padded with zeros.
+//! An image as the networks want it: values as the encoder wants them, the shorter side at one length, padded with zeros.
 
 use sixfold_geometry::RgbImage;
 
 use super::config::AnchoredConfig;
+use crate::network::EncoderKind;
 
+/// torchvision's, of the values of a channel in 0..1.
 const MEAN: [f32; 3] = [0.485, 0.456, 0.406];
 const DEVIATION: [f32; 3] = [0.229, 0.224, 0.225];
-/// Rows and columns are padded to multiples of this, the coarsest stride of the ResNet.
+/// Rows and columns are padded to multiples of this, the coarsest stride of the encoders.
 const ALIGNMENT: usize = 32;
 
+/// A channel's mean and deviation that an encoder was trained with: of EfficientNet-Lite0, `(255 v - 127) / 128`.
+fn statistics(encoder: EncoderKind, channel: usize) -> (f32, f32) {
+    match encoder {
+        EncoderKind::Lite0 => (127.0 / 255.0, 128.0 / 255.0),
+        EncoderKind::ResNet50 => (MEAN[channel % 3], DEVIATION[channel % 3]),
+    }
+}
+
 /// An image of three planes with values in 0..1, in place.
-pub(super) fn normalise(rgb: &mut [f32]) {
+pub(super) fn normalise(rgb: &mut [f32], encoder: EncoderKind) {
     let pixels = rgb.len() / 3;
-    for ((plane, mean), deviation) in rgb.chunks_exact_mut(pixels.max(1)).zip(MEAN).zip(DEVIATION) {
+    for (channel, plane) in rgb.chunks_exact_mut(pixels.max(1)).enumerate() {
+        let (mean, deviation) = statistics(encoder, channel);
         plane.iter_mut().for_each(|v| *v = (*v - mean) / deviation);
     }
 }
@@ -81,8 +92,8 @@ impl Input {
         let mut values = vec![0.0; 3 * pixels];
         let (rows_to, columns_to) = (taps(rows, filled[0]), taps(columns, filled[1]));
         for (channel, target) in values.chunks_exact_mut(pixels).enumerate() {
-            let value =
-                |rgb: &[u8; 3]| (f32::from(rgb[channel]) / 255.0 - MEAN[channel]) / DEVIATION[channel];
+            let (mean, deviation) = statistics(config.encoder, channel);
+            let value = |rgb: &[u8; 3]| (f32::from(rgb[channel]) / 255.0 - mean) / deviation;
             let plane: Vec<f32> = image.as_slice().iter().map(value).collect();
             interpolate(&plane, columns, &rows_to, &columns_to, |x, y, v| target[y * padded[1] + x] = v);
         }
@@ -122,5 +133,13 @@ mod tests {
         assert!(row.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-6), "{row:?}");
         assert_eq!(input.to_image([6.0, 4.0, 3.0, 2.0]), [3.0, 2.0, 1.5, 1.0]);
         assert!(Input::new(&RgbImage::filled(0, 0, [0; 3]), &config).is_none());
+        let lite0 = AnchoredConfig { encoder: EncoderKind::Lite0, ..config };
+        let values = Input::new(&image, &lite0).unwrap().values;
+        let expected = [-127.0, -127.0, -127.0, -63.25, 64.25, 128.0, 0.0].map(|v| v / 128.0);
+        assert!(values.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-6), "{:?}", &values[..7]);
+        let mut rgb = vec![1.0, 0.0, 0.2];
+        normalise(&mut rgb, EncoderKind::Lite0);
+        let expected = [128.0, -127.0, 51.0 - 127.0].map(|v| v / 128.0);
+        assert!(rgb.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-6), "{rgb:?}");
     }
 }

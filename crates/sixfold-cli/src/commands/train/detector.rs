@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use anyhow::Result;
 use clap::Args;
+use sixfold_detect::network::EncoderKind;
 use sixfold_detect::recipe::{DetectorKind, DetectorRecipe, MIN_VISIBILITY};
 use sixfold_nn::choice::Choice;
 
@@ -36,6 +37,9 @@ pub(crate) struct TrainDetectorArguments {
     pub preset: Option<Preset>,
     #[arg(long, value_parser = choices::<DetectorKind>(), help = presets("Which network learns", default().network.name(), published().network.name()))]
     pub network: Option<DetectorKind>,
+    /// What the pyramid of the networks with anchors stands on (default: resnet50, or that of --init)
+    #[arg(long, value_parser = choices::<EncoderKind>())]
+    pub backbone: Option<EncoderKind>,
     /// Training steps
     #[arg(long, value_name = "N", default_value_t = default().steps)]
     pub steps: u64,
@@ -51,8 +55,8 @@ pub(crate) struct TrainDetectorArguments {
     /// Number of the five stages of the ImageNet encoder that are not trained
     #[arg(long, value_name = "N", default_value_t = default().frozen_stages)]
     pub frozen_stages: usize,
-    /// torchvision's ResNet-50 weights (.pth or .safetensors) for --network retinanet (default: random). For the networks with anchors,
-    /// which need it, these or torchvision's weights of the same network, as trained on COCO
+    /// torchvision's ResNet-50 weights (.pth or .safetensors) for --network retinanet (default: random). For the networks with anchors
+    /// on ResNet-50, which need it, these or torchvision's weights of the same network, as trained on COCO
     #[arg(long, value_name = "FILE")]
     pub encoder: Option<PathBuf>,
     /// Side of the training images in pixels, a multiple of 32 (retinanet: 128)
@@ -90,6 +94,7 @@ impl TrainDetectorArguments {
         let default = if self.preset.is_some() { published() } else { default() };
         DetectorRecipe {
             network: self.network.unwrap_or(default.network),
+            backbone: self.backbone,
             steps: self.steps,
             batch: self.batch,
             learning_rate: self.learning_rate,
