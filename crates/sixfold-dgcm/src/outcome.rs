@@ -3,10 +3,10 @@
 //! The dissertation stores successes only ("unsuccessful grasp attempts do not provide any information for replicating past
 //! experience", section 6.2.1), and ranks by the distance of an experience. Failures are informative too: they show how much worse
 //! than the planner assumes a grasp is at the edge of its friction cone, or far from the object's centre, with this gripper and
-//! these pads. So every attempt is stored with a dozen numbers that were known before it, and a logistic regression with a normal
-//! prior (Cox 1958; MAP by Newton's method) predicts the next one. The prior was fitted to simulated attempts: without attempts of
-//! its own, a gripper ranks grasps by the quality of the contacts and the agreement with experience, as in section 6.3.2, and keeps
-//! a distance from the table.
+//! these pads. So every attempt is stored with what was known before it, and a logistic regression on 16 numbers from that, with a
+//! normal prior (Cox 1958; MAP by Newton's method), predicts the next one. The prior was fitted to simulated attempts: without
+//! attempts of its own, a gripper ranks grasps by the quality of the contacts and the agreement with experience, as in section
+//! 6.3.2, and keeps a distance from the table.
 
 use sixfold_experience::Attempt;
 use sixfold_geometry::nalgebra::{SMatrix, SVector};

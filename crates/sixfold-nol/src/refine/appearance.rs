@@ -118,7 +118,7 @@ pub(crate) struct Common {
     channels: usize,
 }
 
-/// Difference in colour (of 0 to 1, root of the mean square over channels) at which a photograph counts half.
+/// Difference in colour (of 0 to 1, root of the mean square over channels) at which a photograph has a quarter of its weight.
 const FAR: f32 = 0.08;
 
 impl Common {
