@@ -102,7 +102,7 @@ const MOST_SAMPLES: usize = 1024;
 pub struct TrainingOptions {
     /// Optimiser steps, 1 or more.
     pub steps: u64,
-    /// Highest learning rate, above 0; it falls to zero as a cosine.
+    /// Maximum learning rate, above 0; it falls to zero as a cosine.
     pub learning_rate: f64,
     /// Initial steps over which the rate rises linearly. In a shorter training it rises until the last step.
     pub warm_up: u64,

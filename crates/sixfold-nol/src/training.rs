@@ -146,8 +146,8 @@ impl Choice for NolLosses {
         match self {
             NolLosses::L1 => "L1 of the colours alone",
             NolLosses::Image => "Colours and features (equation 4.1)",
-            NolLosses::Smooth => "The same and smoothness (equation 4.2)",
-            NolLosses::Gan => "The same and a discriminator that trains beside the network",
+            NolLosses::Smooth => "As image, plus smoothness (equation 4.2)",
+            NolLosses::Gan => "As smooth, plus a discriminator that is trained with the network",
         }
     }
 }

@@ -44,7 +44,7 @@ fn an_object_is_stored_with_templates_and_found() {
     let case = OneImage::new();
     let dir = case.path();
     let run = sixfold(dir, "object add thing part.ply --unit mm --templates").expect(0);
-    assert!(run.stdout.contains("305 views with 7 turns"), "{}", run.stdout);
+    assert!(run.stdout.contains("305 views with 7 rotations"), "{}", run.stdout);
     let file = dir.join("sixfold-objects/thing/templates.bin");
     let bytes = std::fs::read(&file).unwrap();
     let one = sixfold(dir, &format!("--threads 1 {DEPTH} --object thing --json")).expect(0).json();

@@ -194,7 +194,7 @@ fn help_shows_the_defaults() {
         ("pix2pose", "Largest rotation of photographs in the image plane, degrees [default: 45]"),
         ("pix2pose", "Side of the network's input in pixels; the output has half of it [default: 128]"),
         ("pix2pose", "- tless: T-LESS"),
-        ("detector", "Highest learning rate [default: 0.002]"),
+        ("detector", "Maximum learning rate [default: 0.002]"),
         ("detector", "Largest rotation in the image plane, degrees [default: 15]"),
         ("detector", "Default score threshold of the detector, 0 to 1 [default: 0.4]"),
         ("nol", "(default: 5000; the dissertation's network: 350000)"),

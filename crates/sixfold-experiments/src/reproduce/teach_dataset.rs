@@ -27,7 +27,7 @@ use super::teach::{compose, mean_millimetres};
 
 pub(super) const AFTER_HELP: &str = "Example:\n  \
     sixfold reproduce teach-dataset --dataset lmo --objects 5 6 8 9 12 --out out/reproduce-teach-dataset\n\n\
-    Every object is kept. After a stop, the same command resumes.";
+    Finished objects are kept. After a stop, the same command resumes.";
 
 /// Minimum visible fraction of an object that is searched in an image, as in the BOP Challenge.
 const VISIBLE_TO_FIND: f64 = 0.1;
@@ -54,13 +54,13 @@ pub(crate) struct TeachDatasetArguments {
     /// Objects to teach, by their ids
     #[arg(long, value_name = "ID", num_args = 1.., required = true)]
     objects: Vec<u32>,
-    /// Images that teach each object, from as different sides as there are
+    /// Number of images from which each object is learned, chosen from viewpoints as different as possible
     #[arg(long, value_name = "N", default_value_t = 16)]
     photographs: usize,
-    /// An image teaches an object of which at least this fraction is visible
+    /// Minimum visible fraction of an object in the images from which it is learned
     #[arg(long, value_name = "FRACTION", default_value_t = 0.5)]
     min_visible: f64,
-    /// Most other images in which each object is searched
+    /// Maximum number of other images in which each object is searched for
     #[arg(long, value_name = "N", default_value_t = 1000)]
     images: usize,
     /// Folder for the results

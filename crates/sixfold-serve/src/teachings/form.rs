@@ -30,7 +30,7 @@ pub(crate) struct TeachingForm {
     /// Photographs of the object on the printed board, PNG or JPEG, from all sides: 8 to 40 in all, more by further requests.
     #[schema(value_type = Vec<String>, format = Binary)]
     photographs: Vec<Vec<u8>>,
-    /// Depth images from the same places (PNG, one channel of 16 bits), in the order of the photographs' names.
+    /// Depth images from the same viewpoints (PNG, one channel of 16 bits), in the order of the photographs' names.
     #[schema(value_type = Option<Vec<String>>, format = Binary)]
     depth: Option<Vec<Vec<u8>>>,
     /// Millimetres per unit of the depth images; needed with them.

@@ -127,7 +127,7 @@ pub(crate) struct AddArguments {
     /// The part that was grasped, such as handle
     #[arg(long, value_name = "NAME")]
     pub part: Option<String>,
-    /// Where the experience comes from
+    /// Origin of the experience
     #[arg(long, value_name = "TEXT", default_value = "added by hand")]
     pub provenance: String,
     #[command(flatten)]

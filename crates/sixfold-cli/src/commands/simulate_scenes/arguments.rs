@@ -32,7 +32,7 @@ pub(crate) struct SimulateScenesArguments {
     /// Objects: mesh files, or names given with `sixfold object add`
     #[arg(long = "object", value_name = "NAME_OR_MESH", num_args = 1..)]
     pub objects: Vec<String>,
-    /// Unit of mesh files: m, cm, mm, in (meshes in the store know theirs)
+    /// Unit of mesh files: m, cm, mm, in (not needed for stored objects)
     #[arg(long, value_name = "UNIT")]
     pub unit: Option<Unit>,
     /// Folder of stored objects

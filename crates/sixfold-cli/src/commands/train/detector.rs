@@ -22,7 +22,7 @@ fn published() -> DetectorRecipe {
 }
 
 const PHOTOGRAPHS: &str = "Fraction of training images that are parts of photographs, 0 to 1";
-const RENDERS: &str = "Fraction of renders among pasted objects that have photographs, 0 to 1";
+const RENDERS: &str = "Fraction of renders among the pasted objects of which there are photographs, 0 to 1";
 
 #[derive(Debug, Args)]
 pub(crate) struct TrainDetectorArguments {
@@ -31,10 +31,10 @@ pub(crate) struct TrainDetectorArguments {
     /// Folder for checkpoints, learning curves and the finished model
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// Train as published, as far as that is here (docs/published.md): ResNet-50, objects cut out of photographs alone
+    /// Train as published, as far as implemented (docs/published.md): ResNet-50, only objects cut out of photographs
     #[arg(long, value_parser = choices::<Preset>())]
     pub preset: Option<Preset>,
-    #[arg(long, value_parser = choices::<DetectorKind>(), help = presets("Which network learns", default().network.name(), published().network.name()))]
+    #[arg(long, value_parser = choices::<DetectorKind>(), help = presets("Network to train", default().network.name(), published().network.name()))]
     pub network: Option<DetectorKind>,
     /// Training steps
     #[arg(long, value_name = "N", default_value_t = default().steps)]
@@ -42,17 +42,17 @@ pub(crate) struct TrainDetectorArguments {
     /// Images in a step
     #[arg(long, value_name = "N", default_value_t = default().batch)]
     pub batch: usize,
-    /// Highest learning rate
+    /// Maximum learning rate
     #[arg(long, value_name = "RATE", default_value_t = default().learning_rate)]
     pub learning_rate: f64,
-    /// The pretrained encoder's fraction of the learning rate, 0 to 1
+    /// Learning rate of the pretrained encoder, as a fraction of --learning-rate, 0 to 1
     #[arg(long, value_name = "FRACTION", default_value_t = default().encoder_share)]
     pub encoder_share: f64,
     /// Number of the five stages of the ImageNet encoder that are not trained
     #[arg(long, value_name = "N", default_value_t = default().frozen_stages)]
     pub frozen_stages: usize,
-    /// torchvision's ResNet-50 weights (.pth or .safetensors) for --network retinanet (default: random). For the networks with anchors,
-    /// which need it, these or torchvision's weights of the same network, as trained on COCO
+    /// torchvision's ResNet-50 weights (.pth or .safetensors) for --network retinanet (default: random). For the networks with
+    /// anchors, which need it, these or torchvision's weights of the same network, as trained on COCO
     #[arg(long, value_name = "FILE")]
     pub encoder: Option<PathBuf>,
     /// Side of the training images in pixels, a multiple of 32 (retinanet: 128)

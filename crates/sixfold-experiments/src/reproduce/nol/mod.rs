@@ -32,7 +32,7 @@ use sixfold_shell::output::{JsonArguments, report, write_atomically};
 use sixfold_shell::progress::{Progress, check_interrupt};
 
 /// The message after an interrupt.
-const GO_ON: &str = "the rows done so far are kept; run the same command again to continue";
+const GO_ON: &str = "the finished rows are kept; run the same command again to continue";
 /// Side of the views that are compared, pixels.
 const SIDE: usize = 128;
 /// The inputs of the views, in the order of the table.

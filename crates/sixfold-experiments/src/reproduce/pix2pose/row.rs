@@ -151,7 +151,7 @@ impl Bench {
         let mut scenes = BTreeMap::new();
         let mut progress = Progress::new("images", images.len());
         for ((scene_id, im_id), targets) in &images {
-            check_interrupt("the rows done so far are kept; run the same command again to continue")?;
+            check_interrupt("the finished rows are kept; run the same command again to continue")?;
             if let std::collections::btree_map::Entry::Vacant(place) = scenes.entry(*scene_id) {
                 place.insert(self.dataset.scene(*scene_id)?);
             }
