@@ -23,7 +23,7 @@ pub enum PosedImageError {
     },
     /// Image, mask and camera are not of one size.
     #[error(
-        "photograph {name}: the {what} is {width}x{height}, the camera says {camera_width}x{camera_height}; give the camera of this image"
+        "photograph {name}: the {what} is {width}x{height}, the camera is for {camera_width}x{camera_height}; give the camera of this image"
     )]
     Size {
         /// The image.
@@ -62,7 +62,7 @@ pub enum PosedImageError {
         least: usize,
     },
     /// It is unknown where the object is visible.
-    #[error("photograph {name}: no mask says where the object is visible; give its mask")]
+    #[error("photograph {name}: no mask of the visible part of the object; give one")]
     NoMask {
         /// The image.
         name: String,

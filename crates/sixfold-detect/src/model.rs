@@ -66,7 +66,7 @@ pub enum ModelError {
     },
     /// The detector was not trained on this object.
     #[error(
-        "the detector knows the objects {known}, not object {id}; train it (`sixfold train detector`), give other weights or a file of detections"
+        "the detector was trained on objects {known}, not on object {id}; train it (`sixfold train detector`), give other weights or a file of detections"
     )]
     UnknownObject {
         /// The requested object.

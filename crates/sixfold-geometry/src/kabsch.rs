@@ -33,7 +33,7 @@ pub enum AlignmentError {
         found: f64,
     },
     /// Fewer than three points carry weight, or they lie on one line.
-    #[error("the points do not fix a rotation: at least three that are not on one line are needed")]
+    #[error("the points do not determine a rotation: three or more that are not collinear are needed")]
     Degenerate,
 }
 

@@ -78,7 +78,7 @@ impl Pix2PoseEstimator {
             (None, several) => {
                 let ids: Vec<String> = several.iter().map(|o| o.id.to_string()).collect();
                 let text =
-                    format!("--object-id N is missing: the model knows the objects {}", ids.join(", "));
+                    format!("--object-id N is missing: the model was trained on objects {}", ids.join(", "));
                 Err(EstimatorError::method(text))
             }
         }

@@ -52,7 +52,7 @@ pub enum PnpError {
         index: usize,
     },
     /// The points lie on one line or at one place.
-    #[error("the {what} lie on one line or in one place: they do not fix a pose")]
+    #[error("the {what} are collinear or coincide: they do not determine a pose")]
     Degenerate {
         /// Which points.
         what: &'static str,

@@ -314,7 +314,9 @@ pub(super) fn run(app: &App, request: &FindRequest, work: &mut Work<'_>) -> Resu
     }
     let overruled = without_overruled(&mut found);
     if overruled > 0 {
-        notes.push(format!("{overruled} poses are left out: most of their pixels belong to surer ones"));
+        notes.push(format!(
+            "{overruled} poses are left out: most of their pixels belong to more confident ones"
+        ));
     }
     work.step(request.objects.len(), request.objects.len(), "drawing")?;
     let searched = SearchedImage {

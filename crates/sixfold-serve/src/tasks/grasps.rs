@@ -191,10 +191,10 @@ pub(super) fn run(request: &GraspRequest, work: &mut Work<'_>) -> Result<Value, 
     work.overlay(&overlay.map_err(|e| ApiError::system("the overlay", e))?)?;
     let mut notes = vec![];
     if view.is_none() {
-        notes.push("nothing stands on the table".to_owned());
+        notes.push("no object found on the table".to_owned());
     }
     if view.as_ref().is_some_and(|v| v.cut_by_edge) {
-        notes.push("the object is cut by the edge of the image: what lies outside was not seen".to_owned());
+        notes.push("the image cuts the object off: the part outside was not seen".to_owned());
     }
     let object_pixels = view.as_ref().map_or(0, |v| v.mask.as_slice().iter().filter(|m| **m).count());
     Ok(json!({

@@ -262,7 +262,7 @@ impl Format {
                     "mesh",
                     format!("a file named {name:?}"),
                     "a name that ends in .ply, .obj, .stl, .gltf, .glb or .xyz",
-                    "convert the mesh to one of them; the ending says the format",
+                    "convert the mesh to one of them; the file's extension gives the format",
                 ));
             }
         })

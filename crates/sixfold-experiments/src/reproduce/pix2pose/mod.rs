@@ -301,7 +301,7 @@ fn test_targets(
     let known = |t: &Target| t.object.is_some_and(|o| pix2pose.model().object(o.obj_id).is_ok());
     let others = targets.iter().filter(|t| !known(t)).count();
     if others > 0 {
-        eprintln!("note: {others} targets are of objects that the model does not know; they are left out");
+        eprintln!("note: {others} targets are left out: the model was not trained on their objects");
         targets.retain(known);
     }
     // The model's card states its training frames: scores on them would be meaningless.
