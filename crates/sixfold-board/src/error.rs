@@ -34,7 +34,8 @@ pub enum BoardError {
     },
     /// The corners fit no pose of the board.
     #[error(
-        "corners are {found:.1} pixels from where the board would have them, expected at most {most:.1}: is the board flat, and \
+        "corners deviate by {found:.1} pixels from the board's layout, expected at most {most:.1}: is the \
+         board flat, and \
          the camera file that of this photograph?"
     )]
     DoesNotFit {

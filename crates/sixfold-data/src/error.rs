@@ -23,7 +23,8 @@ pub enum PosedImageError {
     },
     /// Image, mask and camera are not of one size.
     #[error(
-        "photograph {name}: the {what} is {width}x{height}, the camera is for {camera_width}x{camera_height}; give the camera of this image"
+        "photograph {name}: the {what} is {width}x{height}, the camera is for \
+         {camera_width}x{camera_height}; give the camera of this image"
     )]
     Size {
         /// The image.

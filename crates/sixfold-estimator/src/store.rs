@@ -112,7 +112,7 @@ pub enum StoreError {
     #[error(transparent)]
     Mesh(#[from] MeshFileError),
     /// A list of points through which no surface can be fitted.
-    #[error("{name}: no surface can be laid through its points")]
+    #[error("{name}: no surface can be fitted to its points")]
     NoSurface {
         /// The object.
         name: String,
@@ -634,7 +634,7 @@ fn with_surface(name: &str, mesh: Mesh) -> Result<(Mesh, Option<String>), StoreE
     if !mesh.faces().is_empty() {
         return Ok((mesh, None));
     }
-    let note = format!("{name} has points and no faces; a surface of small disks is laid through them");
+    let note = format!("{name} has points and no faces; a surface of small disks is fitted to them");
     let mesh = mesh.surfels().map_err(|source| StoreError::NoSurface { name: name.to_owned(), source })?;
     Ok((mesh, Some(note)))
 }

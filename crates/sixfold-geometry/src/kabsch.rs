@@ -12,7 +12,8 @@ use crate::{Mat3, Pose, Vec3};
 pub enum AlignmentError {
     /// The lists have different lengths.
     #[error(
-        "{source_points} source points, {target_points} target points, {weights} weights: all must be equally many"
+        "{source_points} source points, {target_points} target points, {weights} weights: expected equal \
+         numbers"
     )]
     Lengths {
         /// Length of the first list.

@@ -61,7 +61,8 @@ pub enum TemplateError {
     },
     /// The object in the mask has a size that no tabletop object has.
     #[error(
-        "what the mask shows is {found:.3} m large, expected {low} m to {high} m: is the depth scale right, and does the mask hold one object only?"
+        "the surface in the mask is {found:.3} m large, expected {low} m to {high} m: is the depth scale \
+         right, and does the mask hold one object only?"
     )]
     Size {
         /// Largest extent in metres.

@@ -73,7 +73,7 @@ pub enum TrainingLogError {
         reason: String,
     },
     /// The figure could not be drawn.
-    #[error("{}: expected records with losses to draw, found none; train a few steps first", file.display())]
+    #[error("{}: expected records with losses to plot, found none; train a few steps first", file.display())]
     NothingToDraw {
         /// The figure's file.
         file: PathBuf,

@@ -196,8 +196,8 @@ pub enum WeightsError {
         found: String,
     },
     /// A tensor contains an infinite number or NaN.
-    #[error("{}: tensor {tensor}: expected finite numbers, found {found}; the training went astray: \
-        go back to an earlier checkpoint or lower the learning rate", file.display())]
+    #[error("{}: tensor {tensor}: expected finite numbers, found {found}; the training diverged: go back \
+         to an earlier checkpoint or lower the learning rate", file.display())]
     NotFinite {
         /// The file.
         file: PathBuf,

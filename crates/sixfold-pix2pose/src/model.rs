@@ -71,7 +71,8 @@ pub enum ModelError {
     },
     /// The model was not trained on this object.
     #[error(
-        "the model was trained on objects {known}, not on object {id}; train it (`sixfold train pix2pose`) or give other weights"
+        "the model was trained on objects {known}, not on object {id}; train it (`sixfold train pix2pose`) \
+         or give other weights"
     )]
     UnknownObject {
         /// The requested object.

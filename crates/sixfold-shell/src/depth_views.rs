@@ -87,7 +87,8 @@ pub fn templates_of(a: &DepthViewArguments) -> Result<(ObjectTemplates, Vec<Left
     }
     if a.masks.len() != a.depth.len() {
         bail!(
-            "--mask: found {} masks for {} depth images, expected one for each: a template needs the mask of the object",
+            "--mask: found {} masks for {} depth images, expected one for each: a template needs the mask \
+             of the object",
             a.masks.len(),
             a.depth.len()
         );

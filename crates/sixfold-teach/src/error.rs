@@ -91,14 +91,15 @@ pub enum TeachError {
     Sfm(#[source] SfmError),
     /// Without a board the scale in metres is unknown.
     #[error(
-        "photographs without a board do not show how large things are: give the length between two points that you marked in \
+        "photographs without a board do not determine the scale: give the length between two points that \
+         you marked in \
          two or more photographs (--length 0.12 --ends PHOTOGRAPH:X,Y:X,Y), or depth images"
     )]
     NoScale,
     /// Depth images from which the scale cannot be computed.
     #[error(
-        "{found} features of the photographs have a measured depth, expected at least {least}: check --depth-scale and whether depth \
-         images are from the same places, or give --length and --ends"
+        "{found} features of the photographs have a measured depth, expected at least {least}: check \
+         --depth-scale and whether depth images are from the same viewpoints, or give --length and --ends"
     )]
     FewDepths {
         /// Number of features with a measured depth.
@@ -136,8 +137,9 @@ pub enum TeachError {
     },
     /// Masks of photographs contradict each other.
     #[error(
-        "the masks of {contradicting} of {all} photographs contradict the others: transparent and mirroring objects cannot be taught \
-         from photographs, nor what moved between them; correct the masks, or give a mesh"
+        "the masks of {contradicting} of {all} photographs contradict the others: objects that are \
+         transparent or mirroring, or that moved between photographs, cannot be taught; correct the masks, \
+         or give a mesh"
     )]
     Contradicting {
         /// Number of contradicting masks.

@@ -150,7 +150,8 @@ pub(crate) fn compare(a: &CompareArguments) -> Result<Whole> {
     }
     if a.tries == 0 || a.tries > 1 && !a.hard {
         bail!(
-            "--tries: found {}, expected at least 1, and 1 without --hard: without errors of the gripper's pose all tries are the same",
+            "--tries: found {}, expected at least 1, and 1 without --hard: without errors of the gripper's \
+             pose all tries are the same",
             a.tries
         );
     }

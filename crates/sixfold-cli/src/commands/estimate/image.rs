@@ -119,7 +119,8 @@ pub(super) fn run(a: &EstimateArguments) -> Result<Outcome> {
     let place = region::find(common, &input.lens, input.rgb.as_ref())?;
     let region = match &place {
         Where::Anywhere if needs.region == Need::Required => bail!(
-            "--method {} needs a region that contains the object: give --detector FILE.safetensors, --box X,Y,W,H or --mask FILE",
+            "--method {} needs a region that contains the object: give --detector FILE.safetensors, --box \
+             X,Y,W,H or --mask FILE",
             estimator.name()
         ),
         Where::In(region) => Some(region),

@@ -35,7 +35,8 @@ pub(super) const PIX2POSE: Method = Method::of::<Pix2PoseArguments>(
 /// Poses from colour without training for the object.
 pub(super) const VIEWS: Method = Method::of::<ViewsArguments>(
     "views",
-    "rendered views of a mesh matched with a colour image, in given boxes or those of a class-agnostic detector, no training",
+    "rendered views of a mesh matched with a colour image, in given boxes or those of a class-agnostic \
+     detector, no training",
 );
 
 /// All methods together, with probabilities.

@@ -28,7 +28,8 @@ fn defaults() -> (Pix2PoseTrainingOptions, AdversarialOptions) {
 fn steps_help() -> String {
     let (compact, paper) = defaults();
     format!(
-        "Training steps, each with --per-object images of every object (default: {}; the dissertation's networks: {}). 0: keep \
+        "Training steps, each with --per-object images of every object (default: {}; the dissertation's \
+         networks: {}). 0: keep \
          the weights of --init, and only measure the constant error of their alignment again",
         compact.common.steps, paper.steps
     )
