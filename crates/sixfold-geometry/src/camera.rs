@@ -54,7 +54,7 @@ pub enum CameraError {
         found: String,
         /// The expected values.
         expected: &'static str,
-        /// What to do.
+        /// Advice.
         advice: &'static str,
     },
     /// The intrinsics belong to an image of another size.

@@ -189,7 +189,7 @@ impl Jobs {
         self.state().by_number.values().rev().cloned().collect()
     }
 
-    /// How many jobs wait before this one, if it waits.
+    /// Number of jobs ahead of this one, if it waits.
     pub fn ahead(&self, job: &Job) -> Option<usize> {
         let state = self.state();
         (job.state() == JobState::Queued)
