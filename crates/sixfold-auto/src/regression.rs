@@ -213,8 +213,9 @@ mod tests {
     #[test]
     fn what_speaks_the_wrong_way_is_left_out() {
         // A larger number 3 makes a pose more probable; if the rows show the opposite, it is not used.
-        let turned: Vec<(Numbers, bool)> = drawn(2000, 5).into_iter().map(|(n, right)| (n, !right)).collect();
-        let model = fit(&rows(&turned), &[3, 5]);
+        let negated: Vec<(Numbers, bool)> =
+            drawn(2000, 5).into_iter().map(|(n, right)| (n, !right)).collect();
+        let model = fit(&rows(&negated), &[3, 5]);
         assert!(!model.takes.contains(&3), "{model:?}");
         assert!(model.is_whole());
     }

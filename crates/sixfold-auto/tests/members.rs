@@ -191,8 +191,8 @@ fn two_poses_that_look_alike_are_both_said() {
     let camera = camera();
     let query = Query { depth: Some(&depth), ..Query::new(&camera) };
     let half = Pose::exp(&Vector6::new(0.0, 0.0, 0.0, 0.0, 0.0, std::f64::consts::PI));
-    let turned = Pose::new(truth().rotation() * half.rotation(), truth().translation());
-    let poses = found(&[told("a", &[truth(), turned])], |_| (), &query, solid(1.0));
+    let rotated = Pose::new(truth().rotation() * half.rotation(), truth().translation());
+    let poses = found(&[told("a", &[truth(), rotated])], |_| (), &query, solid(1.0));
     let alternatives = poses[0].details["alternatives"].as_array().unwrap();
     assert_eq!(alternatives.len(), 1, "{alternatives:?}");
     let weight = alternatives[0]["weight"].as_f64().unwrap();

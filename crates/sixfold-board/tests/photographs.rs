@@ -95,15 +95,15 @@ fn a_camera_is_calibrated_and_poses_are_exact() {
     }
     assert!(found.rms < 0.2, "{}", found.rms);
     let mut away = vec![];
-    let mut turned = vec![];
+    let mut angles = vec![];
     for (view, truth) in found.views.iter().zip(poses()) {
         let pose = view.as_ref().unwrap().camera_from_board;
         away.push(pose.distance_to(&truth));
-        turned.push(pose.rotation_angle_to(&truth).to_degrees());
+        angles.push(pose.rotation_angle_to(&truth).to_degrees());
     }
     away.sort_by(f64::total_cmp);
-    turned.sort_by(f64::total_cmp);
-    assert!(away[5] < 0.001 && turned[5] < 0.1, "{away:?} {turned:?}");
+    angles.sort_by(f64::total_cmp);
+    assert!(away[5] < 0.001 && angles[5] < 0.1, "{away:?} {angles:?}");
     // With the true camera.
     for (corners, truth) in photographs.iter().zip(poses()) {
         let pose = board_pose(corners, &camera()).unwrap().camera_from_board;

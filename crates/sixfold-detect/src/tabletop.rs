@@ -90,8 +90,8 @@ fn placed(meshes: &[&Mesh], reach: f64, random: &mut Random) -> Vec<(usize, Pose
         let standing = random.random::<f32>() < STANDING;
         let turn =
             about_z * if standing { UnitQuaternion::identity() } else { random_rotation(random).rotation() };
-        let turned = meshes[index].transformed(&Pose::new(turn, Vec3::zeros()));
-        let (low, high) = turned.bounding_box();
+        let rotated = meshes[index].transformed(&Pose::new(turn, Vec3::zeros()));
+        let (low, high) = rotated.bounding_box();
         let size = high - low;
         let radius = 0.4 * size.x.max(size.y);
         let stacked = random.random::<f32>() < STACKED;

@@ -162,10 +162,10 @@ fn an_experience_on_a_handle_leads_to_the_handle_of_another_mug() {
         if let Some(p) = found.proposals.iter().find(|p| p.hypothesis == AlignmentHypothesis::Upright) {
             transferred += 1;
             let wanted = now.handle_grasp();
-            let turned = p.grasp.camera_from_gripper.rotation_angle_to(&wanted.camera_from_gripper);
+            let rotated_by = p.grasp.camera_from_gripper.rotation_angle_to(&wanted.camera_from_gripper);
             let half = Pose::exp(&[0.0, 0.0, 0.0, 0.0, 0.0, std::f64::consts::PI].into());
             let other = (p.grasp.camera_from_gripper * half).rotation_angle_to(&wanted.camera_from_gripper);
-            assert!(turned.min(other) < 0.7, "{there} to {here}: {turned} {other}");
+            assert!(rotated_by.min(other) < 0.7, "{there} to {here}: {rotated_by} {other}");
         }
         let geometry = antipodal_grasps(&now.view, &gripper, &planner).unwrap();
         let ranked = rank_on_part(&geometry, &found, &clusters, &fitter, &OutcomeModel::default());

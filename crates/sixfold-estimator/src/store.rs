@@ -617,8 +617,8 @@ fn loaded(name: &str, record: &ObjectRecord, folder: PathBuf) -> Result<Object, 
         let wrong =
             |what| StoreError::Record { name: name.to_owned(), path: folder.join("object.json"), what };
         let mut of_record = record.info(&read).map_err(wrong)?;
-        let (surface, laid) = with_surface(name, read)?;
-        if laid.is_some() {
+        let (surface, note) = with_surface(name, read)?;
+        if note.is_some() {
             // The surface through the points has a different box.
             let own = ModelInfo::of_mesh(&surface);
             (of_record.diameter, of_record.min, of_record.size) = (own.diameter, own.min, own.size);

@@ -14,7 +14,7 @@ pub fn turn(angle: f64) -> Pose {
 impl Crop {
     /// The crop rotated about its centre by `angle` radians (positive: from x to y), with points, normals and VD-NOC of the
     /// rotated camera. `trim` as in [`crate::CropOptions`].
-    pub fn turned(&self, angle: f64, trim: f64) -> Crop {
+    pub fn rotated(&self, angle: f64, trim: f64) -> Crop {
         let pose = turn(angle);
         let middle = 0.5 * (self.side as f64 - 1.0);
         let (sin, cos) = angle.sin_cos();
@@ -76,17 +76,17 @@ mod tests {
         let mask = Mask::from_fn(640, 480, inside);
         let crop = Crop::new(&depth, &camera, &mask, &CropOptions::compact()).unwrap();
         for angle in [std::f64::consts::FRAC_PI_2, 0.7] {
-            let turned = crop.turned(angle, 0.0);
-            let count = turned.pixels().count() as f64 / crop.pixels().count() as f64;
+            let rotated = crop.rotated(angle, 0.0);
+            let count = rotated.pixels().count() as f64 / crop.pixels().count() as f64;
             assert!((count - 1.0).abs() < 0.05, "{count}");
-            for i in turned.pixels() {
-                let projected = turned.camera.project(&turned.point(i)).unwrap();
+            for i in rotated.pixels() {
+                let projected = rotated.camera.project(&rotated.point(i)).unwrap();
                 let pixel = Vec2::new((i % 96) as f64, (i / 96) as f64);
                 assert!((projected - pixel).norm() < 1.6, "{projected} {pixel}");
             }
             // A rotation preserves depth.
             let far = |c: &Crop| c.pixels().map(|i| c.point(i).z).fold(0.0, f64::max);
-            assert!((far(&turned) - far(&crop)).abs() < 1e-3);
+            assert!((far(&rotated) - far(&crop)).abs() < 1e-3);
         }
     }
 }

@@ -58,8 +58,8 @@ impl Grasp {
     pub fn difference(&self, other: &Grasp) -> (f64, f64) {
         let flipped = other.camera_from_gripper * half_turn();
         let angle = self.camera_from_gripper.rotation_angle_to(&other.camera_from_gripper);
-        let turned = self.camera_from_gripper.rotation_angle_to(&flipped);
-        (self.camera_from_gripper.distance_to(&other.camera_from_gripper), angle.min(turned))
+        let flipped_angle = self.camera_from_gripper.rotation_angle_to(&flipped);
+        (self.camera_from_gripper.distance_to(&other.camera_from_gripper), angle.min(flipped_angle))
     }
 }
 

@@ -89,7 +89,7 @@ impl Element {
     }
 
     /// The minimum number of bytes of a row in the body.
-    fn least_bytes(&self, encoding: Encoding) -> usize {
+    fn min_bytes(&self, encoding: Encoding) -> usize {
         match encoding {
             // A digit and a separator.
             Encoding::Ascii => 2 * self.properties.len(),
@@ -423,7 +423,7 @@ pub fn parse_ply(
     let mut seen_vertices = false;
     let mut list = Vec::new();
     for element in &header.elements {
-        let least = element.least_bytes(header.encoding);
+        let least = element.min_bytes(header.encoding);
         // The last line may lack its end.
         let available = body.left() + usize::from(header.encoding == Encoding::Ascii);
         if element.count.checked_mul(least).is_none_or(|needed| needed > available) {

@@ -102,6 +102,6 @@ fn along_the_ray(scene: &DepthRegion, cloud: &PointCloud, camera_from_view: &Pos
 
 /// The pose of a template's reference point for a match: the view rotated by `turn` in the region's frame.
 pub fn camera_from_view(camera_from_roi: &Pose, turn: f64) -> Pose {
-    let turned = sixfold_geometry::nalgebra::UnitQuaternion::from_axis_angle(&Vec3::z_axis(), turn);
-    *camera_from_roi * Pose::new(turned, Vec3::zeros())
+    let rotated = sixfold_geometry::nalgebra::UnitQuaternion::from_axis_angle(&Vec3::z_axis(), turn);
+    *camera_from_roi * Pose::new(rotated, Vec3::zeros())
 }

@@ -24,7 +24,7 @@ use crate::regions::RegionCache;
 use crate::roi::Roi;
 
 /// Regions compared with their templates as pairs: fewest and most. Chosen by hand; not swept.
-const LOOKED_AT: (usize, usize) = (64, 400);
+const COMPARED: (usize, usize) = (64, 400);
 /// Pairs that go through the network at a time; does not affect the result.
 const AT_A_TIME: usize = 32;
 /// Lower bound of the trust in a pair, so that the network cannot reject a pose whose surface agrees. Chosen by hand; not swept.
@@ -37,7 +37,7 @@ const ONE_IN: usize = 5;
 const LESS: usize = 30;
 /// Fraction (numerator, denominator) of the compared regions, the best matching ones, whose templates are aligned with the scene;
 /// chosen by hand, not swept.
-const LAID: (usize, usize) = (3, 4);
+const ALIGNED: (usize, usize) = (3, 4);
 /// Nearest templates examined per hypothesis of a region: most of them are neighbours of one another. Chosen by hand; not swept.
 const NEAREST: usize = 60;
 impl KnownObject {
@@ -100,8 +100,8 @@ pub(crate) fn first_matching(
     let nearest = learned.nearest(&regions.descriptors);
     let mut order: Vec<usize> = (0..rois.len()).collect();
     order.sort_by(|&a, &b| nearest[a].0.total_cmp(&nearest[b].0).then(a.cmp(&b)));
-    let looked_at = (rois.len() / ONE_IN).saturating_sub(LESS).clamp(LOOKED_AT.0, LOOKED_AT.1);
-    let chosen = apart(rois, order, APART * diameter, looked_at);
+    let compared = (rois.len() / ONE_IN).saturating_sub(LESS).clamp(COMPARED.0, COMPARED.1);
+    let chosen = apart(rois, order, APART * diameter, compared);
     let entries: Vec<Entry> = chosen.iter().map(|&i| object.matcher.entries()[nearest[i].1]).collect();
     let says: Vec<Vec<PairSays>> = chosen
         .par_chunks(AT_A_TIME)
@@ -113,7 +113,7 @@ pub(crate) fn first_matching(
     let says = says.concat();
     let mut order: Vec<usize> = (0..chosen.len()).collect();
     order.sort_by(|&a, &b| says[b].matching.total_cmp(&says[a].matching).then(a.cmp(&b)));
-    order.truncate(LAID.0 * looked_at / LAID.1);
+    order.truncate(ALIGNED.0 * compared / ALIGNED.1);
     let by_points = (options.matched_by == MatchedBy::Both).then(|| {
         // Regions centred on the predicted centre of the object.
         let centred: Vec<Roi> = order

@@ -5,7 +5,9 @@ use sixfold_geometry::{Camera, DepthImage, Mask, Pose, Vec2, Vec3};
 use crate::error::TemplateError;
 use crate::roi::ray_rotation;
 use crate::store::MAX_TEMPLATES;
-use crate::template::{ObjectTemplates, SIDE, Source, Template, TemplateOptions, middle_pixel, patch_camera};
+use crate::template::{
+    ObjectTemplates, SIDE, Source, Template, TemplateOptions, central_pixel, patch_camera,
+};
 
 /// Sizes of tabletop objects, metres: other sizes indicate a wrong depth scale or mask. Chosen by hand; not swept.
 const SIZES: (f64, f64) = (0.015, 0.6);
@@ -135,7 +137,7 @@ fn largest_extent(seen: &[Seen]) -> f64 {
 
 fn cut(view: &DepthView<'_>, seen: &[Seen], size: f64) -> Template {
     let pixels: Vec<[usize; 2]> = seen.iter().map(|s| s.0).collect();
-    let middle = middle_pixel(&pixels).unwrap_or_default();
+    let middle = central_pixel(&pixels).unwrap_or_default();
     let reference = seen.iter().find(|s| s.0 == middle).map_or(Vec3::z(), |s| s.1);
     let distance = reference.norm();
     let patch = patch_camera(size, distance);

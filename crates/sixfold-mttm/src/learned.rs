@@ -115,9 +115,9 @@ impl Learned {
     /// The pose that the network predicts for a template in the camera frame: rotation, and position of the reference point; `None`
     /// if the network was not trained to predict the position.
     pub fn camera_from_view(&self, camera_from_roi: &Pose, turn: f64, says: &PairSays) -> Option<Pose> {
-        let turned = UnitQuaternion::from_axis_angle(&Vec3::z_axis(), turn);
+        let rotated = UnitQuaternion::from_axis_angle(&Vec3::z_axis(), turn);
         let place = Vec3::from(says.offset?) * self.size;
-        Some(*camera_from_roi * Pose::new(says.rotation * turned, place))
+        Some(*camera_from_roi * Pose::new(says.rotation * rotated, place))
     }
 }
 

@@ -108,8 +108,8 @@ fn region(
     let bare = model.without_background(&encoded, cells_of(scene, roi, size, first_mask));
     let Some(descriptor) = model.describe(&bare).into_iter().next() else { return vec![] };
     let camera_from_roi = roi.camera_from_roi();
-    let turned = |e: &Entry| crate::align::camera_from_view(&camera_from_roi, e.turn);
-    let pose = |e: &Entry| object.object_pose(&turned(e), e.template);
+    let rotated = |e: &Entry| crate::align::camera_from_view(&camera_from_roi, e.turn);
+    let pose = |e: &Entry| object.object_pose(&rotated(e), e.template);
     let mut entries: Vec<Entry> = vec![];
     for (_, number) in learned.ranked(&descriptor).into_iter().take(NEAREST * options.hypotheses) {
         if entries.len() == options.hypotheses {
@@ -155,13 +155,13 @@ pub(crate) fn start(
     says: &PairSays,
     options: &MttmOptions,
 ) -> Pose {
-    let turned = crate::align::camera_from_view(camera_from_roi, entry.turn);
+    let rotated = crate::align::camera_from_view(camera_from_roi, entry.turn);
     let rotation = if options.predicted_pose {
         camera_from_roi.rotation()
             * says.rotation
-            * (camera_from_roi.rotation().inverse() * turned.rotation())
+            * (camera_from_roi.rotation().inverse() * rotated.rotation())
     } else {
-        turned.rotation()
+        rotated.rotation()
     };
     let of_template = object.surfaces[entry.template].dense.centroid().unwrap_or_else(Vec3::zeros);
     Pose::new(rotation, centre - rotation * of_template)

@@ -132,9 +132,9 @@ fn the_best_match_has_the_turn_of_the_image() {
     let templates = ObjectTemplates::from_mesh(&mesh, &TemplateOptions::default()).unwrap();
     let matcher = Matcher::new(&templates, &MatchOptions::default());
     for (number, turn) in [(40, 0.6), (150, -0.6), (220, 0.35)] {
-        let turned = UnitQuaternion::from_axis_angle(&Vec3::z_axis(), turn);
+        let rotated = UnitQuaternion::from_axis_angle(&Vec3::z_axis(), turn);
         let roi = Roi { centre: Vec3::new(0.0, 0.0, 0.8) };
-        let truth = Pose::new(turned, roi.centre) * templates.templates[number].view_from_object;
+        let truth = Pose::new(rotated, roi.centre) * templates.templates[number].view_from_object;
         let mut frame = VisibilityBuffer::new(&camera());
         frame.render(&[SceneObject { mesh: &mesh, camera_from_object: truth }], &RenderOptions::default());
         let cells = roi.cells(&prepared(&frame.depth()), templates.size, |_| true);

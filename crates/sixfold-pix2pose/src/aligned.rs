@@ -79,7 +79,7 @@ pub fn estimate_aligned(
     mesh: &Mesh,
     options: &AlignOptions,
 ) -> Result<Option<Aligned>, EstimateError> {
-    let look = |region: &Rect| -> Result<Option<Aligned>, EstimateError> {
+    let run_pass = |region: &Rect| -> Result<Option<Aligned>, EstimateError> {
         let Some(found) = estimate(model, image, camera, object_id, region, &options.estimate)? else {
             return Ok(None);
         };
@@ -88,18 +88,18 @@ pub fn estimate_aligned(
         let (camera_from_object, improved) = (refined.camera_from_object, refined.improved);
         Ok(Some(Aligned { camera_from_object, score, improved, found }))
     };
-    let Some(mut best) = look(region)? else { return Ok(None) };
-    let mut looked_at = *region;
+    let Some(mut best) = run_pass(region)? else { return Ok(None) };
+    let mut last_box = *region;
     for _ in 1..options.looks.max(1) {
         let Some(whole) = projected_box(mesh, camera, &best.camera_from_object) else { break };
-        if !best.improved || !alike(&whole, region) || same(&whole, &looked_at) {
+        if !best.improved || !alike(&whole, region) || same(&whole, &last_box) {
             break;
         }
-        let Ok(Some(again)) = look(&whole) else { break };
+        let Ok(Some(again)) = run_pass(&whole) else { break };
         if !again.improved {
             break;
         }
-        (best, looked_at) = (again, whole);
+        (best, last_box) = (again, whole);
     }
     if options.correct && best.improved {
         let correction = model.object(object_id)?.1.correction;

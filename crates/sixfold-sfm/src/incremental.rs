@@ -42,7 +42,7 @@ pub(crate) struct Growing<'a> {
 
 impl<'a> Growing<'a> {
     /// Starts with two photographs and the motion between them; `None` if they have too few points in common.
-    pub fn begun(
+    pub fn started(
         pixels: &'a [Vec<Vec2>],
         tracks: &'a [Track],
         options: &'a SfmOptions,

@@ -274,7 +274,7 @@ fn best_beginning<'a>(
     let beginnings = order.iter().flat_map(|(pair, v, _)| v.motions.iter().map(move |m| (*pair, m)));
     let mut best: Option<Growing<'a>> = None;
     for (pair, motion) in beginnings.take(BEGINNINGS) {
-        let Some(mut state) = Growing::begun(pixels, tracks, options, lens, pair, motion) else { continue };
+        let Some(mut state) = Growing::started(pixels, tracks, options, lens, pair, motion) else { continue };
         if !state.grow(group, go) {
             return Err(SfmError::Stopped);
         }

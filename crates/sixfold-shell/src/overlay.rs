@@ -359,12 +359,12 @@ mod tests {
         let mesh = square();
         let image = RgbImage::filled(160, 120, [0; 3]);
         let sure = draw(&image, &camera(), &[drawn(&mesh, 0.0, 0.51)]);
-        let doubtful = draw(&image, &camera(), &[drawn(&mesh, 0.0, 0.49)]);
+        let uncertain = draw(&image, &camera(), &[drawn(&mesh, 0.0, 0.49)]);
         assert!(left_edge(&sure).iter().all(|set| *set));
-        let (set, gaps): (Vec<bool>, Vec<bool>) = left_edge(&doubtful).into_iter().partition(|set| *set);
+        let (set, gaps): (Vec<bool>, Vec<bool>) = left_edge(&uncertain).into_iter().partition(|set| *set);
         assert!(set.len() > 10 && gaps.len() > 10, "{} {}", set.len(), gaps.len());
         let inside = |image: &RgbImage| image[(64, 70)][0];
-        assert!(inside(&doubtful) > 20 && inside(&doubtful) < inside(&sure), "{}", inside(&doubtful));
+        assert!(inside(&uncertain) > 20 && inside(&uncertain) < inside(&sure), "{}", inside(&uncertain));
     }
 
     #[test]

@@ -84,9 +84,9 @@ impl Dropped {
         let high = corners().fold(Vec3::repeat(f64::NEG_INFINITY), |high, c| high.sup(c));
         let middle = (low + high) * 0.5;
         let radius = corners().map(|c| (c - middle).norm()).fold(0.0, f64::max);
-        let turned = || corners().map(|c| rotation * (c - middle));
-        let width = turned().map(|c| c.xy().norm()).fold(0.0, f64::max);
-        let below = turned().map(|c| -c.z).fold(0.0, f64::max);
+        let rotated = || corners().map(|c| rotation * (c - middle));
+        let width = rotated().map(|c| c.xy().norm()).fold(0.0, f64::max);
+        let below = rotated().map(|c| -c.z).fold(0.0, f64::max);
         Dropped { number, upright, parts, rotation, middle, radius, width, below }
     }
 

@@ -63,7 +63,7 @@ pub(crate) fn painted(mesh: &Mesh, views: &[View]) -> Painted {
                     seen.push((cosine * cosine, bilinear_rgb(&view.image, pixel.x, pixel.y)));
                 }
             }
-            middle_color(&seen)
+            median_color(&seen)
         })
         .collect();
     let unseen = unseen_fraction(mesh, &colors);
@@ -71,7 +71,7 @@ pub(crate) fn painted(mesh: &Mesh, views: &[View]) -> Painted {
 }
 
 /// The weighted median of each channel, which is robust to moving highlights and to single wrong photographs.
-fn middle_color(seen: &[(f64, [f64; 3])]) -> Option<[u8; 3]> {
+fn median_color(seen: &[(f64, [f64; 3])]) -> Option<[u8; 3]> {
     let total: f64 = seen.iter().map(|s| s.0).sum();
     if seen.is_empty() {
         return None;

@@ -90,9 +90,9 @@ fn cloud(mesh: &Mesh, seed: u64) -> PointCloud {
 fn aligned(given: &Mesh, hull: &Mesh) -> Vec<Pose> {
     let diameter = given.diameter();
     let (source, target) = (cloud(given, 1), cloud(hull, 2));
-    let (own_tree, middle) = (KdTree::new(&source.points), middle_of(given));
+    let (own_tree, middle) = (KdTree::new(&source.points), centre_of(given));
     let Ok(target) = IndexedCloud::new(target) else { return vec![] };
-    let there = middle_of(hull);
+    let there = centre_of(hull);
     let options = IcpOptions {
         levels: vec![
             IcpLevel { rejection_distance: 0.4 * diameter, iterations: 8, stride: 2 },
@@ -153,7 +153,7 @@ fn rotations() -> Vec<UnitQuaternion<f64>> {
     all
 }
 
-fn middle_of(mesh: &Mesh) -> Vec3 {
+fn centre_of(mesh: &Mesh) -> Vec3 {
     let (low, high) = mesh.bounding_box();
     0.5 * (low + high)
 }
@@ -222,7 +222,7 @@ impl Fit<'_> {
         let mut twist = Vector6::zeros();
         twist[axis] = by;
         let step = Pose::exp(&twist);
-        let middle = pose.transform_point(&middle_of(&self.mesh));
+        let middle = pose.transform_point(&centre_of(&self.mesh));
         let shifted = pose.translation() - middle;
         Pose::new(step.rotation() * pose.rotation(), step.rotation() * shifted + middle + step.translation())
     }

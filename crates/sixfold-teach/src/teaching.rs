@@ -33,7 +33,7 @@ use crate::snapshot::{Snapshot, State, VERSION};
 use crate::view::Volume;
 
 /// Maximum number of photographs.
-pub const MOST_PHOTOGRAPHS: usize = 200;
+pub const MAX_PHOTOGRAPHS: usize = 200;
 /// The file of a mesh that was given.
 const GIVEN_MESH: &str = "given.ply";
 
@@ -222,9 +222,9 @@ impl Teaching {
         let png = bytes.starts_with(b"\x89PNG");
         let there = self.known.state.photographs.iter().position(|p| p.name == name);
         let number = there.unwrap_or(self.known.state.photographs.len());
-        if number >= MOST_PHOTOGRAPHS {
+        if number >= MAX_PHOTOGRAPHS {
             let what = format!(
-                "expected at most {MOST_PHOTOGRAPHS} photographs; leave out those that show nothing new"
+                "expected at most {MAX_PHOTOGRAPHS} photographs; leave out those that show nothing new"
             );
             return Err(TeachError::File { path: PathBuf::from(name), what });
         }

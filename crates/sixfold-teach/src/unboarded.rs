@@ -24,7 +24,7 @@ const FEATURES: usize = 2048;
 /// between the sides of an object the ground rotates in the image.
 const ROTATIONS: [f64; 4] = [-90.0, -45.0, 45.0, 90.0];
 /// Smallest product of two descriptors that match, as in the authors' `match`.
-const LEAST_PRODUCT: f32 = 0.82;
+const MIN_PRODUCT: f32 = 0.82;
 /// Focal length if unknown, as a fraction of the image's longer side: between a phone (0.72) and a webcam (1.1).
 const FOCAL_LENGTH: f64 = 0.9;
 /// Largest distance of a marked point from its position according to the other photographs, as a fraction of the image's longer
@@ -198,7 +198,7 @@ fn scene_of(
     let features: Vec<Features> = seen.iter().map(usable).collect();
     let pairs = seen.len() * seen.len().saturating_sub(1) / 2;
     let total = 2 * pairs + seen.len();
-    let matches = matched(&features, LEAST_PRODUCT, &|done: usize, _: usize| progress.report(done, total))
+    let matches = matched(&features, MIN_PRODUCT, &|done: usize, _: usize| progress.report(done, total))
         .ok_or(TeachError::Stopped)?;
     let longest = size.0.max(size.1) as f64;
     let mut focal_lengths: Vec<f64> =

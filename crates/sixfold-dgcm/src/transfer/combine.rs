@@ -104,9 +104,9 @@ fn mean_pose(poses: &[Pose]) -> Pose {
     let (mut translation, mut rotation) = (Vec3::zeros(), Quaternion::from_parts(0.0, Vec3::zeros()));
     let first = poses.first().copied().unwrap_or_else(Pose::identity);
     for pose in poses {
-        let turned = *pose * half_turn;
+        let rotated = *pose * half_turn;
         let nearer =
-            if turned.rotation_angle_to(&first) < pose.rotation_angle_to(&first) { turned } else { *pose };
+            if rotated.rotation_angle_to(&first) < pose.rotation_angle_to(&first) { rotated } else { *pose };
         let q = nearer.rotation().into_inner();
         let sign = if q.dot(&first.rotation().into_inner()) < 0.0 { -1.0 } else { 1.0 };
         rotation += q * sign;

@@ -201,7 +201,7 @@ pub fn propose(
             let copy = if m.angle == 0.0 {
                 stored.experience.crop.clone()
             } else {
-                stored.experience.crop.turned(m.angle, trim)
+                stored.experience.crop.rotated(m.angle, trim)
             };
             experiences.push((*m, stored, copy));
         }
@@ -247,12 +247,12 @@ pub fn propose(
         .map(|((from, stored, copy), coordinates)| {
             let e = &stored.experience;
             let region = rotated_region(&e.region, copy);
-            let turned_grasp = turn(from.angle) * e.camera_from_gripper;
+            let rotated_grasp = turn(from.angle) * e.camera_from_gripper;
             let aligned = transfer(&crop, &cloud, coordinates, copy, &region, &options.align);
             aligned
                 .iter()
                 .filter_map(|t| {
-                    let source = Source { copy, grasp: &turned_grasp, opening: e.opening, width: e.width };
+                    let source = Source { copy, grasp: &rotated_grasp, opening: e.opening, width: e.width };
                     let placed = match options.reach {
                         None => place(fitter, gripper, &source, t),
                         Some(reach) => at_distance(fitter, &source, t, reach).map(|g| (g, 0.0, false)),

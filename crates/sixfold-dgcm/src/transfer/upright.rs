@@ -20,7 +20,7 @@ const CLOSER: usize = 8;
 /// Alignments rotated by less than this are the same, radians.
 const SAME: f64 = 0.6;
 /// Penalty of a rotation by 180 degrees, so that for a round object the same side is chosen.
-const TURNED: f64 = 0.01;
+const PENALTY_180: f64 = 0.01;
 
 /// The alignment of an experience's upright object.
 #[derive(Debug, Clone, Copy)]
@@ -76,7 +76,7 @@ impl Upright {
         let here = pair.here.points.iter().zip(&pair.telling_here);
         let back: f64 = here.map(|(p, w)| w * pair.there.at(&self.back(p))).sum();
         let second = back / pair.telling_here.iter().sum::<f64>().max(1e-9);
-        self.fit = 0.5 * (first + second) - 0.5 * TURNED * (1.0 - self.yaw.cos());
+        self.fit = 0.5 * (first + second) - 0.5 * PENALTY_180 * (1.0 - self.yaw.cos());
     }
 }
 
@@ -313,9 +313,9 @@ mod tests {
         let anywhere: Vec<Upright> = (0..TURNS)
             .map(|k| {
                 let yaw = TAU * k as f64 / TURNS as f64;
-                let mut turned = Upright { yaw, stretch: [1.0; 2], shift: Vec3::zeros(), fit: 0.0 };
-                turned.shift = axis - turned.map(&axis);
-                turned
+                let mut rotated = Upright { yaw, stretch: [1.0; 2], shift: Vec3::zeros(), fit: 0.0 };
+                rotated.shift = axis - rotated.map(&axis);
+                rotated
             })
             .collect();
         pair.weigh(&anywhere);

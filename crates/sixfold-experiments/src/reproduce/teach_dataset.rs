@@ -20,7 +20,7 @@ use sixfold_shell::Outcome;
 use sixfold_shell::output::{JsonArguments, report, write_atomically};
 use sixfold_shell::progress::{Progress, check_interrupt};
 use sixfold_shell::ranges::in_range;
-use sixfold_teach::{MOST_PHOTOGRAPHS, SalientSegmenter, ShapeOptions, Teaching};
+use sixfold_teach::{MAX_PHOTOGRAPHS, SalientSegmenter, ShapeOptions, Teaching};
 use sixfold_views::estimator::ViewsEstimator;
 
 use super::teach::{compose, mean_millimetres};
@@ -136,7 +136,7 @@ impl Seen {
 
 pub(super) fn run(a: &TeachDatasetArguments, json: &JsonArguments) -> Result<Outcome> {
     in_range("--min-visible", a.min_visible, 0.0..=1.0)?;
-    in_range("--photographs", a.photographs, 4..=MOST_PHOTOGRAPHS)?;
+    in_range("--photographs", a.photographs, 4..=MAX_PHOTOGRAPHS)?;
     let dataset = BopDataset::open(&a.dataset, &a.split)?;
     let info = dataset.models_info(Models::Rendering)?.unwrap_or_default();
     let mut meshes = BTreeMap::new();

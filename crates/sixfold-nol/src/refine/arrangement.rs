@@ -113,15 +113,15 @@ impl Arrangement {
             return false;
         }
         let twist = |at: usize| -> Vector6<f64> { step.fixed_rows::<6>(at).into_owned() };
-        let turned = |pose: &Pose, about: Vec3, twist: Vector6<f64>| {
+        let rotated = |pose: &Pose, about: Vec3, twist: Vector6<f64>| {
             let about = Pose::from_translation(about);
             about * Pose::exp(&twist) * about.inverse() * *pose
         };
         for (i, (camera, middle)) in self.camera_from_scene.iter_mut().zip(middles).enumerate() {
-            *camera = turned(camera, middle, twist(6 * i));
+            *camera = rotated(camera, middle, twist(6 * i));
         }
         for (o, (place, centre)) in self.scene_from_object.iter_mut().zip(centres).enumerate() {
-            *place = turned(place, centre, twist(6 * (images + o)));
+            *place = rotated(place, centre, twist(6 * (images + o)));
         }
         true
     }

@@ -114,7 +114,7 @@ pub(crate) async fn find(State(app): Shared, request: HttpRequest) -> Answer<Acc
         let images = ImageBytes::of_form(&form)?;
         let request = FindRequest::of_form(app, &form)?;
         request.check(app, &images)?;
-        let job = Request::Find(request).lay_down(app, &images.files())?;
+        let job = Request::Find(request).store_job(app, &images.files())?;
         Ok(Accepted(JobView::of(app, &job)))
     })
     .await

@@ -100,7 +100,7 @@ pub(crate) async fn grasps(State(app): Shared, request: HttpRequest) -> Answer<A
         let request = GraspRequest::of_form(&form)?;
         request.gripper()?;
         Images::decode(&images, request.depth_scale)?;
-        let job = Request::Grasps(request).lay_down(app, &images.files())?;
+        let job = Request::Grasps(request).store_job(app, &images.files())?;
         Ok(Accepted(JobView::of(app, &job)))
     })
     .await

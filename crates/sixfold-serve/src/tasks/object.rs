@@ -124,7 +124,7 @@ pub(crate) async fn add_object(State(app): Shared, request: HttpRequest) -> Answ
         let names: Vec<String> = (0..resources.len()).map(|i| format!("resource-{i}")).collect();
         let beside = names.iter().map(String::as_str).zip(resources.iter().map(|r| r.bytes.as_ref()));
         let files: Vec<(&str, &[u8])> = [("mesh", mesh.bytes.as_ref())].into_iter().chain(beside).collect();
-        let job = Request::Object(request).lay_down(app, &files)?;
+        let job = Request::Object(request).store_job(app, &files)?;
         Ok(Accepted(JobView::of(app, &job)))
     })
     .await

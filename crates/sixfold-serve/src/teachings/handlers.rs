@@ -148,7 +148,7 @@ pub(crate) async fn add_photographs(
                 "send what is to be added",
             ));
         }
-        let most = sixfold_teach::MOST_PHOTOGRAPHS;
+        let most = sixfold_teach::MAX_PHOTOGRAPHS;
         if known.photographs().len() + given.photographs() > most {
             let found = format!("{} and {} more", known.photographs().len(), given.photographs());
             return Err(ApiError::field(

@@ -68,11 +68,11 @@ impl Cutout {
             let low = (centre - reach).floor().clamp(0.0, limit as f32) as usize;
             low..((centre + reach).ceil().clamp(0.0, limit as f32) as usize)
         };
-        let (middle_x, middle_y) = (0.5 * (self.width as f32 - 1.0), 0.5 * (self.height as f32 - 1.0));
+        let (centre_x, centre_y) = (0.5 * (self.width as f32 - 1.0), 0.5 * (self.height as f32 - 1.0));
         for y in span(centre[1], height) {
             for x in span(centre[0], width) {
                 let (dx, dy) = ((x as f32 - centre[0]) * scale, (y as f32 - centre[1]) * scale);
-                let (u, v) = (c * dx + s * dy + middle_x, c * dy - s * dx + middle_y);
+                let (u, v) = (c * dx + s * dy + centre_x, c * dy - s * dx + centre_y);
                 let (color, covered) = self.sample(u, v);
                 if covered <= 0.0 {
                     continue;

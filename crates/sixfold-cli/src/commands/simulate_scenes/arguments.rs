@@ -17,7 +17,7 @@ use sixfold_shell::ranges::{folder_name, in_range, without_duplicates};
 use sixfold_shell::scenes::NamedModels;
 
 /// Maximum number of synthetic objects of a kind: each is kept in memory with its mesh.
-const MOST_OBJECTS: usize = 10_000;
+const MAX_OBJECTS: usize = 10_000;
 
 /// Shown under `sixfold simulate-scenes --help`.
 pub(crate) const AFTER_HELP: &str = "Examples:\n  \
@@ -126,8 +126,8 @@ impl SimulateScenesArguments {
         let counts = [
             ("--scenes", self.scenes, 1..=1_000_000),
             ("--views", self.views, 1..=10_000),
-            ("--members", self.members, 1..=MOST_OBJECTS),
-            ("--toys", self.toys, 0..=MOST_OBJECTS),
+            ("--members", self.members, 1..=MAX_OBJECTS),
+            ("--toys", self.toys, 0..=MAX_OBJECTS),
         ];
         for (option, value, range) in counts {
             in_range(option, value, range)?;

@@ -297,16 +297,16 @@ fn overlap(a: &Rect, b: &Rect) -> f64 {
 
 /// The image with the left, right, upper or lower half of a box black.
 fn half_black(image: &RgbImage, region: &Rect, side: u64) -> RgbImage {
-    let (middle_x, middle_y) = (region.x + 0.5 * region.width, region.y + 0.5 * region.height);
+    let (centre_x, centre_y) = (region.x + 0.5 * region.width, region.y + 0.5 * region.height);
     Image::from_fn(image.width(), image.height(), |x, y| {
         let (u, v) = (x as f64, y as f64);
         let inside =
             u >= region.x && v >= region.y && u < region.x + region.width && v < region.y + region.height;
         let half = match side {
-            0 => u < middle_x,
-            1 => u >= middle_x,
-            2 => v < middle_y,
-            _ => v >= middle_y,
+            0 => u < centre_x,
+            1 => u >= centre_x,
+            2 => v < centre_y,
+            _ => v >= centre_y,
         };
         if inside && half { [0; 3] } else { image[(x, y)] }
     })
