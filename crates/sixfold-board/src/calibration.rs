@@ -70,15 +70,15 @@ pub fn calibrate(
     for _ in 0..3 {
         let used: Vec<usize> = (0..states.len()).filter(|i| states[*i].is_ok()).collect();
         if used.len() < FEWEST {
-            return Err(BoardError::TooFewPhotographs { found: used.len(), least: FEWEST });
+            return Err(BoardError::TooFewPhotographs { found: used.len(), minimum: FEWEST });
         }
         let views: Vec<Vec<Corner>> = used.iter().map(|i| photographs[*i].clone()).collect();
         let found = of_views(&views, size, options)?;
         let mut all_fit = true;
         for ((i, residuals), corners) in used.iter().zip(&found.residuals).zip(&views) {
-            let (rms, most) = (root_mean_square(residuals), allowed_misfit(corners));
-            if rms > most {
-                states[*i] = Err(BoardError::DoesNotFit { found: rms, most });
+            let (rms, maximum) = (root_mean_square(residuals), allowed_misfit(corners));
+            if rms > maximum {
+                states[*i] = Err(BoardError::DoesNotFit { found: rms, maximum });
                 all_fit = false;
             }
         }

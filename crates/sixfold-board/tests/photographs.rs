@@ -122,7 +122,7 @@ fn what_cannot_be_used_is_refused_with_the_reason() {
     let blank = detect_tags(&Image::filled(64, 48, [200; 3]));
     assert!(blank.tags.is_empty() && blank.mirrored == 0);
     let few = &corners(&good)[..8];
-    assert_eq!(board_pose(few, &camera()), Err(BoardError::TooFewTags { found: 2, least: 4 }));
+    assert_eq!(board_pose(few, &camera()), Err(BoardError::TooFewTags { found: 2, minimum: 4 }));
     // The camera of another image.
     let other = Camera { fx: 2000.0, ..camera() };
     assert!(matches!(board_pose(&corners(&good), &other), Err(BoardError::DoesNotFit { .. })));
@@ -154,7 +154,7 @@ fn what_cannot_be_used_is_refused_with_the_reason() {
     let refused = calibrate(&frontal, (960, 720), &CalibrationOptions::default());
     assert!(matches!(refused, Err(BoardError::Undetermined { .. } | BoardError::NoSolution)), "{refused:?}");
     let refused = calibrate(&frontal[..2], (960, 720), &CalibrationOptions::default());
-    assert_eq!(refused, Err(BoardError::TooFewPhotographs { found: 2, least: 4 }));
+    assert_eq!(refused, Err(BoardError::TooFewPhotographs { found: 2, minimum: 4 }));
 }
 
 #[test]

@@ -52,7 +52,7 @@ pub enum PosedImageError {
     },
     /// Too little of the object is visible to learn from.
     #[error(
-        "photograph {name}: its mask holds {pixels} pixels of the object, expected at least {least}; leave this image out or check its pose"
+        "photograph {name}: its mask holds {pixels} pixels of the object, expected at least {minimum}; leave this image out or check its pose"
     )]
     NotVisible {
         /// The image.
@@ -60,7 +60,7 @@ pub enum PosedImageError {
         /// Visible pixels.
         pixels: usize,
         /// The minimum number.
-        least: usize,
+        minimum: usize,
     },
     /// It is unknown where the object is visible.
     #[error("photograph {name}: no mask of the visible part of the object; give one")]

@@ -125,7 +125,7 @@ impl PosedImage {
         let Some(mask) = &self.mask else { return Err(PosedImageError::NoMask { name: name() }) };
         let pixels = mask.pixels();
         if pixels < MIN_PIXELS {
-            return Err(PosedImageError::NotVisible { name: name(), pixels, least: MIN_PIXELS });
+            return Err(PosedImageError::NotVisible { name: name(), pixels, minimum: MIN_PIXELS });
         }
         Ok(())
     }

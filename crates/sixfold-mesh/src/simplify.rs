@@ -490,8 +490,8 @@ mod tests {
             let points: Vec<Vec3> = points.into_iter().map(Vec3::from).collect();
             let query = Vec3::from(query);
             let found = KdTree::new(&points).nearest(&query).unwrap().index;
-            let least = points.iter().map(|p| (p - query).norm_squared()).fold(f64::INFINITY, f64::min);
-            prop_assert_eq!((points[found] - query).norm_squared(), least);
+            let minimum = points.iter().map(|p| (p - query).norm_squared()).fold(f64::INFINITY, f64::min);
+            prop_assert_eq!((points[found] - query).norm_squared(), minimum);
         }
     }
 }

@@ -55,7 +55,7 @@ impl ObjectTemplates {
         options.check()?;
         let first = views.first().ok_or(TemplateError::NoViews)?;
         if views.len() > MAX_TEMPLATES {
-            return Err(TemplateError::TooManyViews { found: views.len(), most: MAX_TEMPLATES });
+            return Err(TemplateError::TooManyViews { found: views.len(), maximum: MAX_TEMPLATES });
         }
         let posed = first.camera_from_object.is_some();
         let mut extent = 0f64;

@@ -98,7 +98,7 @@ pub fn check_mask(depth: &DepthImage, camera: &Camera, mask: &Mask) -> Result<Ch
         return Err(TemplateError::MaskTooLarge {
             on_plane: checked.on_plane,
             beyond_edges: checked.beyond_edges,
-            most: MAX_LEFT_OUT,
+            maximum: MAX_LEFT_OUT,
         });
     }
     Ok(checked)

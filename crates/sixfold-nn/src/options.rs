@@ -55,17 +55,17 @@ impl OptionError {
         OptionError::unless(value <= MAX_STEPS, "steps", value, "at most 100000000")
     }
 
-    /// Returns this error unless the number of samples per step is at least `least` and not more than fit into memory.
+    /// Returns this error unless the number of samples per step is at least `minimum` and not more than fit into memory.
     ///
     /// # Errors
     /// [`OptionError`].
     pub fn unless_samples(
         field: &'static str,
         value: usize,
-        least: usize,
+        minimum: usize,
         expected: &'static str,
     ) -> Result<(), OptionError> {
-        OptionError::unless(value >= least, field, value, expected)?;
+        OptionError::unless(value >= minimum, field, value, expected)?;
         OptionError::unless(value <= MAX_SAMPLES, field, value, "at most 1024")
     }
 

@@ -37,7 +37,7 @@ pub fn choose_images(object: &mut RoughObject, most: usize) -> Result<Vec<String
         let covered = view.visible_fraction();
         if covered < MIN_MASK {
             let name = image.posed.name().to_owned();
-            let wrong = NolError::Mask { name, share: 100.0 * covered, least: 100.0 * MIN_MASK };
+            let wrong = NolError::Mask { name, share: 100.0 * covered, minimum: 100.0 * MIN_MASK };
             notes.push(format!("{wrong}; left out"));
             shown.push(vec![]);
             continue;
@@ -46,8 +46,8 @@ pub fn choose_images(object: &mut RoughObject, most: usize) -> Result<Vec<String
     }
     let points = surface.points.len();
     shown.iter_mut().for_each(|s| s.resize(points, 0.0));
-    let least = if object.images.len() > most { 0.0 } else { MIN_GAIN * 0.01 };
-    let chosen = choose_by_surface(&shown, None, most, least);
+    let minimum = if object.images.len() > most { 0.0 } else { MIN_GAIN * 0.01 };
+    let chosen = choose_by_surface(&shown, None, most, minimum);
     let mut number = 0;
     object.images.retain(|_| {
         number += 1;

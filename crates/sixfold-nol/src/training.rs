@@ -105,9 +105,9 @@ impl NolTrainingOptions {
         OptionError::unless(all, "batch.sides", format!("{sides:?}"), expected)?;
         let sources = self.batch.max_sources;
         OptionError::unless((1..=16).contains(&sources), "batch.max_sources", sources, "1 to 16")?;
-        let least = self.batch.min_sources;
+        let minimum = self.batch.min_sources;
         let expected = "1 to batch.max_sources";
-        OptionError::unless((1..=sources).contains(&least), "batch.min_sources", least, expected)?;
+        OptionError::unless((1..=sources).contains(&minimum), "batch.min_sources", minimum, expected)?;
         OptionError::unless_weight("adversarial", self.adversarial)?;
         self.weights.iter().try_for_each(|weight| OptionError::unless_weight("weights", *weight))
     }

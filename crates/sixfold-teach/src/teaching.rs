@@ -322,7 +322,7 @@ impl Teaching {
         }
         if self.known.state.photographs.iter().all(|p| p.left_out.is_some()) {
             let found =
-                TeachError::TooFewPhotographs { found: 0, least: self.fewest(), reasons: String::new() };
+                TeachError::TooFewPhotographs { found: 0, minimum: self.fewest(), reasons: String::new() };
             return Err(self.with_reasons(found));
         }
         self.known.state.located = Some((None, camera, 0.0));
@@ -405,13 +405,13 @@ impl Teaching {
     /// Adds the reasons why photographs are not used to an error about too few.
     fn with_reasons(&self, error: TeachError) -> TeachError {
         match error {
-            TeachError::TooFewPhotographs { found, least, .. } => {
+            TeachError::TooFewPhotographs { found, minimum, .. } => {
                 let all = self.known.state.photographs.iter();
                 let reasons: Vec<String> = all
                     .filter_map(|p| Some(format!("; {}: {}", p.name, p.left_out.as_ref()?)))
                     .take(5)
                     .collect();
-                TeachError::TooFewPhotographs { found, least, reasons: reasons.concat() }
+                TeachError::TooFewPhotographs { found, minimum, reasons: reasons.concat() }
             }
             other => other,
         }
@@ -440,12 +440,12 @@ impl Teaching {
                 None
             });
         }
-        let least = self.fewest();
+        let minimum = self.fewest();
         let found = masks.iter().flatten().count();
-        if found < least {
+        if found < minimum {
             return Err(self.with_reasons(TeachError::TooFewPhotographs {
                 found,
-                least,
+                minimum,
                 reasons: String::new(),
             }));
         }

@@ -230,7 +230,7 @@ fn guessed((width, height): (usize, usize), focal_length: Option<f64>) -> Camera
 fn named(error: SfmError, seen: &[SeenFeatures], size: (usize, usize)) -> TeachError {
     match error {
         SfmError::Stopped => TeachError::Stopped,
-        SfmError::TooFew { found, least, left_out } => {
+        SfmError::TooFew { found, minimum, left_out } => {
             let name = |i: usize| seen[i].name.clone();
             let of = |(s, reason): (&SeenFeatures, Option<sixfold_sfm::LeftOut>)| {
                 let reason = if s.size == size { reason?.reason(&name) } else { other_size(s.size, size) };
@@ -241,7 +241,7 @@ fn named(error: SfmError, seen: &[SeenFeatures], size: (usize, usize)) -> TeachE
             if all.len() > 5 {
                 reasons.push_str(&format!("; and {} more", all.len() - 5));
             }
-            TeachError::NotTogether { found, least, reasons }
+            TeachError::NotTogether { found, minimum, reasons }
         }
         other => TeachError::Sfm(other),
     }
@@ -373,7 +373,7 @@ fn metres_of_depth(
     let count = ratios.len();
     match median(&mut ratios) {
         Some(metres) if count >= FEWEST_DEPTHS && metres > 0.0 => Ok(metres),
-        _ => Err(TeachError::FewDepths { found: count, least: FEWEST_DEPTHS }),
+        _ => Err(TeachError::FewDepths { found: count, minimum: FEWEST_DEPTHS }),
     }
 }
 

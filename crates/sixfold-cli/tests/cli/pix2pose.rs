@@ -23,10 +23,10 @@ fn one_image(tiny: &Tiny) -> String {
     let truth = tiny.truth_of(4, 1);
     let corners: Vec<_> =
         part().vertices().iter().filter_map(|v| camera().project(&truth.transform_point(v))).collect();
-    let least = |f: fn(&sixfold_geometry::Vec2) -> f64| corners.iter().map(f).fold(f64::INFINITY, f64::min);
+    let minimum = |f: fn(&sixfold_geometry::Vec2) -> f64| corners.iter().map(f).fold(f64::INFINITY, f64::min);
     let most =
         |f: fn(&sixfold_geometry::Vec2) -> f64| corners.iter().map(f).fold(f64::NEG_INFINITY, f64::max);
-    let (x, y) = (least(|c| c.x), least(|c| c.y));
+    let (x, y) = (minimum(|c| c.x), minimum(|c| c.y));
     format!("{} --box {x},{y},{},{}", without_box(), most(|c| c.x) - x, most(|c| c.y) - y)
 }
 

@@ -189,9 +189,9 @@ pub fn rank_on_part(
 ) -> Vec<Ranked> {
     let mut candidates = candidates(geometry, &experience.proposals, clusters);
     for c in &mut candidates {
-        let least = if c.kind == Kind::Experience { 0.01 } else { 0.0 };
+        let minimum = if c.kind == Kind::Experience { 0.01 } else { 0.0 };
         c.score = c.success_probability(&c.grasp, fitter, outcomes)
-            * experience.holds_the_same(&c.grasp, fitter.gripper()).max(least);
+            * experience.holds_the_same(&c.grasp, fitter.gripper()).max(minimum);
     }
     candidates.retain(|c| c.score > 0.0);
     joined(candidates, clusters).0
