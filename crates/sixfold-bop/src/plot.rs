@@ -171,11 +171,11 @@ mod tests {
             let x = LEFT + (PANEL_WIDTH - LEFT - RIGHT) * 3 / 4 + 7;
             let dark: Vec<usize> =
                 (TOP..PANEL_HEIGHT - BOTTOM - 4).filter(|&y| picture[(x, y)] == INK).collect();
-            let middle = dark.iter().sum::<usize>() as f64 / dark.len() as f64;
+            let centre = dark.iter().sum::<usize>() as f64 / dark.len() as f64;
             let expected = TOP as f64 + (PANEL_HEIGHT - TOP - BOTTOM) as f64 * (1.0 - recall);
             assert!(
-                (middle - expected).abs() < 2.0,
-                "recall {recall}: line at {middle}, expected {expected}"
+                (centre - expected).abs() < 2.0,
+                "recall {recall}: line at {centre}, expected {expected}"
             );
         }
     }

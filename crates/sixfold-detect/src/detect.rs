@@ -1,6 +1,6 @@
 //! From an image to boxes: resizing and padding, decoding, non-maximum suppression, masks.
 
-use crate::loss::{distance, middle};
+use crate::loss::{cell_centre, distance};
 use crate::network::{DetectorConfig, FINEST_STRIDE, MASK_STRIDE};
 use sixfold_geometry::stats::sigmoid;
 use sixfold_geometry::{Mask, Rect, RgbImage};
@@ -201,7 +201,7 @@ pub fn decode(
                 continue;
             }
             let (class, location) = (index / locations, index % locations);
-            let [x, y] = middle(location, width, stride as f32);
+            let [x, y] = cell_centre(location, width, stride as f32);
             let far: [f32; 4] =
                 std::array::from_fn(|i| distance(raw.boxes[level][i * locations + location], stride as f32));
             let corners = [

@@ -121,11 +121,18 @@ pub(crate) fn tabletop(
 ) -> Tabletop {
     let field = f64::from(uniform(random, FIELD));
     let focal = 0.5 * side as f64 / (0.5 * field).tan();
-    let middle = 0.5 * (side as f64 - 1.0);
+    let principal = 0.5 * (side as f64 - 1.0);
     let pixels = f64::from(uniform(random, PIXELS.map(f32::ln)).exp());
     let distance = focal * DIAMETER / pixels;
-    let camera =
-        Camera { fx: focal, fy: focal, cx: middle, cy: middle, width: side, height: side, distortion: None };
+    let camera = Camera {
+        fx: focal,
+        fy: focal,
+        cx: principal,
+        cy: principal,
+        width: side,
+        height: side,
+        distortion: None,
+    };
     let camera_from_table = looking_down(distance, random);
     let reach = 0.45 * side as f64 * distance / focal;
     let placed = placed(meshes, reach, random);

@@ -56,8 +56,8 @@ fn seen(seed: u64, yaw: f64) -> Seen {
 impl Seen {
     /// The part in the centre between the pads of a grasp.
     fn part_of(&self, grasp: &Grasp) -> &'static str {
-        let middle = centre_between_pads(&grasp.camera_from_gripper);
-        self.mug.part_at(&self.camera_from_object.inverse().transform_point(&middle))
+        let centre = centre_between_pads(&grasp.camera_from_gripper);
+        self.mug.part_at(&self.camera_from_object.inverse().transform_point(&centre))
     }
 
     /// A grasp of the handle from outside.
@@ -97,7 +97,7 @@ fn as_published_the_network_alone_transfers_to_a_fixed_distance() {
     let fitter = GraspFitter::new(&now.view, &gripper, &planner).unwrap();
     let options = ProposeOptions::published();
     let found = propose(&fitter, &model, &mut memory, &options).unwrap();
-    assert!(!found.proposals.is_empty() && found.middles.is_empty());
+    assert!(!found.proposals.is_empty() && found.grasp_centres.is_empty());
     for p in &found.proposals {
         assert_eq!((p.hypothesis, p.moved), (AlignmentHypothesis::Scaled, 0.0));
         let reach = fitter.reach(&p.grasp.camera_from_gripper, gripper.max_opening).unwrap();

@@ -16,14 +16,14 @@ impl Crop {
     /// rotated camera. `trim` as in [`crate::CropOptions`].
     pub fn rotated(&self, angle: f64, trim: f64) -> Crop {
         let pose = turn(angle);
-        let middle = 0.5 * (self.side as f64 - 1.0);
+        let centre = 0.5 * (self.side as f64 - 1.0);
         let (sin, cos) = angle.sin_cos();
         let rotate = |p: Vec2| Vec2::new(cos * p.x - sin * p.y, sin * p.x + cos * p.y);
         let back = |p: Vec2| Vec2::new(cos * p.x + sin * p.y, -sin * p.x + cos * p.y);
         // The principal point rotates about the crop's centre. Both focal lengths are equal except for sensors whose pixels are not
         // square.
-        let principal = rotate(Vec2::new(self.camera.cx - middle, self.camera.cy - middle));
-        let camera = Camera { cx: principal.x + middle, cy: principal.y + middle, ..self.camera };
+        let principal = rotate(Vec2::new(self.camera.cx - centre, self.camera.cy - centre));
+        let camera = Camera { cx: principal.x + centre, cy: principal.y + centre, ..self.camera };
         let total = self.side * self.side;
         let mut out = Crop {
             side: self.side,
@@ -42,9 +42,9 @@ impl Crop {
         };
         let mut seen = vec![];
         for i in 0..total {
-            let here = Vec2::new((i % self.side) as f64 - middle, (i / self.side) as f64 - middle);
+            let here = Vec2::new((i % self.side) as f64 - centre, (i / self.side) as f64 - centre);
             let there = back(here);
-            let (x, y) = ((there.x + middle).round(), (there.y + middle).round());
+            let (x, y) = ((there.x + centre).round(), (there.y + centre).round());
             if x < 0.0 || y < 0.0 || x >= self.side as f64 || y >= self.side as f64 {
                 continue;
             }

@@ -67,14 +67,14 @@ impl Surface {
             return;
         }
         let axis = (high - low).imax();
-        let middle = triangles.len() / 2;
+        let half = triangles.len() / 2;
         let place = |t: &([Vec3; 3], u32)| t.0.iter().map(|c| c[axis]).sum::<f64>();
-        triangles.select_nth_unstable_by(middle, |a, b| place(a).total_cmp(&place(b)).then(a.1.cmp(&b.1)));
-        let (left, right) = triangles.split_at_mut(middle);
+        triangles.select_nth_unstable_by(half, |a, b| place(a).total_cmp(&place(b)).then(a.1.cmp(&b.1)));
+        let (left, right) = triangles.split_at_mut(half);
         self.build(left, first);
         self.nodes[node].next = self.nodes.len() as u32;
         self.nodes[node].count = 0;
-        self.build(right, first + middle);
+        self.build(right, first + half);
     }
 
     /// The nearest surface point to `p`, metres.

@@ -95,8 +95,8 @@ fn along_the_ray(scene: &DepthRegion, cloud: &PointCloud, camera_from_view: &Pos
     if off.len() < MIN_DIFFERENCES {
         return *camera_from_view;
     }
-    let middle = off.len() / 2;
-    let shift = *off.select_nth_unstable_by(middle, f64::total_cmp).1;
+    let half = off.len() / 2;
+    let shift = *off.select_nth_unstable_by(half, f64::total_cmp).1;
     camera_from_view.with_translation(centre + ray * shift)
 }
 

@@ -137,8 +137,8 @@ fn largest_extent(seen: &[Seen]) -> f64 {
 
 fn cut(view: &DepthView<'_>, seen: &[Seen], size: f64) -> Template {
     let pixels: Vec<[usize; 2]> = seen.iter().map(|s| s.0).collect();
-    let middle = central_pixel(&pixels).unwrap_or_default();
-    let reference = seen.iter().find(|s| s.0 == middle).map_or(Vec3::z(), |s| s.1);
+    let central = central_pixel(&pixels).unwrap_or_default();
+    let reference = seen.iter().find(|s| s.0 == central).map_or(Vec3::z(), |s| s.1);
     let distance = reference.norm();
     let patch = patch_camera(size, distance);
     let camera_from_patch = ray_rotation(&reference);
@@ -160,10 +160,10 @@ fn cut(view: &DepthView<'_>, seen: &[Seen], size: f64) -> Template {
         })
         .collect();
     let view_from_camera = Pose::new(camera_from_patch.inverse(), -Vec3::z() * distance);
-    let middle = seen.iter().map(|s| s.1).sum::<Vec3>() / seen.len() as f64;
+    let centroid = seen.iter().map(|s| s.1).sum::<Vec3>() / seen.len() as f64;
     let view_from_object = match view.camera_from_object {
         Some(pose) => view_from_camera * pose,
-        None => view_from_camera * Pose::new(camera_from_patch, middle),
+        None => view_from_camera * Pose::new(camera_from_patch, centroid),
     };
     Template { view_from_object, distance, depth }
 }

@@ -89,9 +89,9 @@ impl TemplateSurface {
         let mut patch = Patch::empty(side);
         let (sin, cos) = turn.sin_cos();
         let scale = size / side as f64 / self.pixel_size;
-        let (middle, centre) = ((side as f64 - 1.0) / 2.0, (SIDE as f64 - 1.0) / 2.0);
+        let (own_centre, centre) = ((side as f64 - 1.0) / 2.0, (SIDE as f64 - 1.0) / 2.0);
         for i in 0..side * side {
-            let (u, v) = (((i % side) as f64 - middle) * scale, ((i / side) as f64 - middle) * scale);
+            let (u, v) = (((i % side) as f64 - own_centre) * scale, ((i / side) as f64 - own_centre) * scale);
             let (x, y) = ((cos * u + sin * v + centre).round(), (-sin * u + cos * v + centre).round());
             if !(x >= 0.0 && y >= 0.0 && x < SIDE as f64 && y < SIDE as f64) {
                 continue;

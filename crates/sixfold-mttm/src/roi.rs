@@ -228,11 +228,11 @@ mod tests {
         let centre = scene.camera().unproject(&Vec2::new(150.0, 340.0), 0.6);
         let cells = Roi { centre }.cells(&scene, 0.06, |_| true);
         let at = |column: usize, row: usize| cells[row * GRID + column];
-        let middle = at(GRID / 2, GRID / 2);
-        assert!(middle[0].abs() < 0.003, "{middle:?}");
+        let central = at(GRID / 2, GRID / 2);
+        assert!(central[0].abs() < 0.003, "{central:?}");
         // The box faces the camera's axis; the region's axis is a ray 20 degrees from it.
         let axis = centre.normalize();
-        assert!((f64::from(middle[3]) + axis.z).abs() < 0.01, "{middle:?}");
+        assert!((f64::from(central[3]) + axis.z).abs() < 0.01, "{central:?}");
         let nothing = Roi { centre }.cells(&scene, 0.06, |_| false);
         assert!(nothing.iter().all(|c| *c == UNKNOWN));
     }

@@ -176,8 +176,8 @@ fn the_network_says_where_and_how_an_object_lies_and_which_pairs_match() {
         let says = model.compare(&region.select(&[0, 0]), &learned.templates(&[right, wrong]));
         let pose = learned.camera_from_view(&camera_from_roi, right.turn, &says[0]).unwrap()
             * object.templates[right.template].view_from_object;
-        let middle = pose.transform_point(&truth.inverse().transform_point(&centre));
-        places.push((middle - centre).norm() / beside.norm());
+        let found_centre = pose.transform_point(&truth.inverse().transform_point(&centre));
+        places.push((found_centre - centre).norm() / beside.norm());
         turns.push(pose.rotation_angle_to(&truth) / angle_of(&right));
         sure.push(says[0].matching - says[1].matching);
         // Cells of the region that look at the object, and those that the mask head takes for it.

@@ -383,9 +383,9 @@ mod tests {
         let rows: Vec<u32> = (TOP as u32..PANEL_HEIGHT - BOTTOM as u32)
             .filter(|y| picture.get_pixel(x, *y).0 == COLORS[0])
             .collect();
-        let middle = rows.iter().sum::<u32>() as f64 / rows.len() as f64;
+        let centre = rows.iter().sum::<u32>() as f64 / rows.len() as f64;
         let expected = TOP + 0.75 * (f64::from(PANEL_HEIGHT) - TOP - BOTTOM);
-        assert!((middle - expected).abs() < 2.0, "line at {middle}, expected {expected}");
+        assert!((centre - expected).abs() < 2.0, "line at {centre}, expected {expected}");
         assert!(draw_curves(&[], &png).unwrap_err().to_string().contains("train a few steps first"));
     }
 }

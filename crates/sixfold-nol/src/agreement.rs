@@ -103,10 +103,10 @@ mod tests {
         let (mesh, truth, list) = photographs(40, [0.0, 0.0], 5);
         // A bright occluder hides half of the block in the first one.
         let side = 96;
-        let middle = list[0].camera().project(&truth[0].translation()).unwrap().x;
+        let centre = list[0].camera().project(&truth[0].translation()).unwrap().x;
         let mut image = (**list[0].image()).clone();
         for (x, y) in (0..240).flat_map(|y| (0..320).map(move |x| (x, y))) {
-            if (x as f64) < middle {
+            if (x as f64) < centre {
                 image[(x, y)] = [250, 250, 20];
             }
         }

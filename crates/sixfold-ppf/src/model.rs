@@ -249,12 +249,12 @@ impl ObjectModel {
         let directions = sphere_directions(VIEWS);
         let distance = VIEW_DISTANCE * diameter;
         let focal = VIEW_FILL * VIEW_PIXELS as f64 * distance / (diameter * VIEW_SPAN);
-        let middle = (VIEW_PIXELS as f64 - 1.0) / 2.0;
+        let principal = (VIEW_PIXELS as f64 - 1.0) / 2.0;
         let camera = Camera {
             fx: focal,
             fy: focal,
-            cx: middle,
-            cy: middle,
+            cx: principal,
+            cy: principal,
             width: VIEW_PIXELS,
             height: VIEW_PIXELS,
             distortion: None,

@@ -241,14 +241,14 @@ fn portrait(mesh: &Mesh) -> RgbImage {
     let tilt = Rotation3::from_axis_angle(&Vector3::x_axis(), 120f64.to_radians());
     let turn = Rotation3::from_axis_angle(&Vector3::z_axis(), 30f64.to_radians());
     let rotation = UnitQuaternion::from_rotation_matrix(&(tilt * turn));
-    let middle = rotation * ((low + high) * 0.5);
+    let box_centre = rotation * ((low + high) * 0.5);
     // As near as possible: the vertices determine the smallest distance at which the object fits.
     let half = FILLED * 0.5 * SIDE as f64;
     let far_enough = mesh.vertices().iter().map(|v| {
-        let v = rotation * v - middle;
+        let v = rotation * v - box_centre;
         focal / half * v.x.abs().max(v.y.abs()) - v.z
     });
-    let pose = Pose::new(rotation, Vec3::new(0.0, 0.0, far_enough.fold(0.0, f64::max)) - middle);
+    let pose = Pose::new(rotation, Vec3::new(0.0, 0.0, far_enough.fold(0.0, f64::max)) - box_centre);
     let objects = [SceneObject { mesh, camera_from_object: pose }];
     let mut frame = VisibilityBuffer::new(&camera);
     frame.render(&objects, &RenderOptions::default());

@@ -190,10 +190,10 @@ fn surface(image: &mut RgbImage, mask: &Mask, pose: &Drawn<'_>, shade: impl Fn(u
     let inside =
         |x: isize, y: isize| x >= 0 && y >= 0 && mask.get(x as usize, y as usize).copied().unwrap_or(false);
     // Dashes are angular sectors about the box's centre, sized to give about the wanted length along the outline.
-    let middle = [0.5 * (left + right), 0.5 * (top + bottom)];
+    let centre = [0.5 * (left + right), 0.5 * (top + bottom)];
     let dashes = (2.0 * (right - left + bottom - top) / DASH).round().max(4.0);
     let is_gap = |x: usize, y: usize| {
-        let angle = (y as f64 - middle[1]).atan2(x as f64 - middle[0]) / std::f64::consts::TAU;
+        let angle = (y as f64 - centre[1]).atan2(x as f64 - centre[0]) / std::f64::consts::TAU;
         !pose.is_sure() && (dashes * angle).rem_euclid(1.0) < 0.5
     };
     for (x, y) in (top as usize..bottom as usize)
@@ -266,8 +266,8 @@ fn rectangle(image: &mut RgbImage, [left, top, right, bottom]: Corners, color: [
 
 /// A small text on a coloured background with its lower left corner at a point, moved to stay within the image.
 pub fn label(image: &mut RgbImage, [x, y]: [f64; 2], text: &str, color: [u8; 3]) {
-    let middle = x + 0.5 * (6 * text.chars().count() + 2) as f64;
-    let label = Label { text: text.into(), of: [middle, y, middle, y], color, is_sure: true };
+    let centre = x + 0.5 * (6 * text.chars().count() + 2) as f64;
+    let label = Label { text: text.into(), of: [centre, y, centre, y], color, is_sure: true };
     draw_labels(image, &[label]);
 }
 

@@ -51,9 +51,10 @@ impl<'a> Ready<'a> {
     fn new(cone: &Cone<'a>) -> Option<Ready<'a>> {
         let [x, y, width, height] = cone.mask.bounding_box()?;
         let camera = cone.camera.without_distortion();
-        let middle = Vec2::new(x as f64 + 0.5 * width as f64 - 0.5, y as f64 + 0.5 * height as f64 - 0.5);
+        let box_centre = Vec2::new(x as f64 + 0.5 * width as f64 - 0.5, y as f64 + 0.5 * height as f64 - 0.5);
         let world_from_camera = cone.camera_from_world.inverse();
-        let direction = world_from_camera.transform_direction(&camera.unproject(&middle, 1.0)).normalize();
+        let direction =
+            world_from_camera.transform_direction(&camera.unproject(&box_centre, 1.0)).normalize();
         let half = 0.5 * (width as f64).hypot(height as f64) / camera.fx;
         let possible = match cone.unknown {
             Some(unknown) if unknown.size() == cone.mask.size() => {

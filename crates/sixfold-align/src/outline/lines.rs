@@ -258,8 +258,8 @@ pub fn add_lines(
         return;
     }
     let mut offsets: Vec<f64> = lines.iter().map(|line| line.offset.abs()).collect();
-    let middle = offsets.len() / 2;
-    let deviation = DEVIATION_FROM_MEDIAN * *offsets.select_nth_unstable_by(middle, f64::total_cmp).1;
+    let half = offsets.len() / 2;
+    let deviation = DEVIATION_FROM_MEDIAN * *offsets.select_nth_unstable_by(half, f64::total_cmp).1;
     let robust = robust * deviation.max(MIN_DEVIATION);
     for line in lines {
         let rows = motion(crop, &line.point, centre);

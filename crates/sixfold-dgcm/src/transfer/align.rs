@@ -222,9 +222,10 @@ fn refine(
     };
     match icp(&source, cloud, start, &icp_options) {
         Ok(report) => {
-            let middle = source.centroid().unwrap_or_else(Vec3::zeros);
-            let moved =
-                (report.target_from_source.transform_point(&middle) - start.transform_point(&middle)).norm();
+            let source_centroid = source.centroid().unwrap_or_else(Vec3::zeros);
+            let moved = (report.target_from_source.transform_point(&source_centroid)
+                - start.transform_point(&source_centroid))
+            .norm();
             let rotated = report.target_from_source.rotation_angle_to(start);
             if moved <= options.icp_distance && rotated <= options.icp_angle {
                 (report.target_from_source, Some(report.rms))

@@ -362,12 +362,12 @@ mod tests {
             let tip = Vec3::new(x, 0.0, 0.575);
             fitter.fit(&gripper_pose(&tip, &Vec3::z(), &Vec3::y()).unwrap(), 0.06).unwrap()
         };
-        let (end, middle) = (at(0.12), at(0.05));
+        let (end, centre) = (at(0.12), at(0.05));
         // A gripper that lost every object over which its pads reached by less than 3 cm, wherever it was held.
         let attempts: Vec<Attempt> = (0..80)
             .map(|k| {
                 let overlap = 0.001 * f64::from(k % 50);
-                let description = GraspDescription { overlap, ..fitter.describe(&middle) };
+                let description = GraspDescription { overlap, ..fitter.describe(&centre) };
                 Attempt {
                     description,
                     share: 0.0,
@@ -382,18 +382,18 @@ mod tests {
             .collect();
         let clusters = ClusterOptions::default();
         let rank =
-            |outcomes: &OutcomeModel| rank_by_outcome(&[end, middle], &[], &clusters, &fitter, outcomes);
+            |outcomes: &OutcomeModel| rank_by_outcome(&[end, centre], &[], &clusters, &fitter, outcomes);
         let untaught = rank(&OutcomeModel::default());
         assert!(untaught[0].grasp.camera_from_gripper.translation().x < 0.06, "nearer to the middle");
         let taught = rank(&OutcomeModel::learn(&attempts, &gripper.name));
         assert_eq!(taught.len(), 2);
         let depth = |r: &Ranked| fitter.describe(&r.grasp).overlap;
         assert!(
-            depth(&taught[0]) > fitter.describe(&middle).overlap + 0.005,
+            depth(&taught[0]) > fitter.describe(&centre).overlap + 0.005,
             "it reaches deeper: {taught:?}"
         );
         let outcomes = OutcomeModel::learn(&attempts, &gripper.name);
-        let unmoved = outcomes.success_probability(&fitter.describe(&middle), 0.0, false);
+        let unmoved = outcomes.success_probability(&fitter.describe(&centre), 0.0, false);
         assert!(taught[0].score > 1.5 * unmoved, "{} {unmoved}", taught[0].score);
         assert!(taught.is_sorted_by(|a, b| a.score >= b.score));
         // The moved grasp still satisfies the planner's tests.
@@ -420,8 +420,13 @@ mod tests {
         let mut held_before = vec![0.0; crop.mask.len()];
         crop.pixels().filter(|&i| crop.points[i][0] < -0.06).for_each(|i| held_before[i] = 0.7);
         let elsewhere = Proposal { grasp: at(0.06), ..proposal(0.0, 0.9) };
-        let found =
-            Proposals { nearest: vec![], crop, proposals: vec![elsewhere], held_before, middles: vec![] };
+        let found = Proposals {
+            nearest: vec![],
+            crop,
+            proposals: vec![elsewhere],
+            held_before,
+            grasp_centres: vec![],
+        };
         // The success probability is highest at the centre of the bar, but its left end was requested.
         let ranked = rank_on_part(
             &[at(0.0), at(-0.09)],

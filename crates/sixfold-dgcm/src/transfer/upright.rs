@@ -111,7 +111,7 @@ pub(super) fn upright(here: &Shape, there: &Shape, held: &[Vec3]) -> Vec<Upright
         return vec![];
     }
     let up = (here.height / there.height).clamp(0.5, 2.0);
-    let middle = Shape::middle(here.points.iter().copied());
+    let centre = Shape::centre(here.points.iter().copied());
     let few: Vec<Vec3> = there.points.iter().step_by(3).copied().collect();
     let few_held: Vec<Vec3> = held.iter().step_by(2).copied().collect();
     let ones = |shape: &Shape| vec![1.0; shape.points.len()];
@@ -123,7 +123,7 @@ pub(super) fn upright(here: &Shape, there: &Shape, held: &[Vec3]) -> Vec<Upright
             let mut tried = Upright { yaw, stretch: [stretch, up], shift: Vec3::zeros(), fit: 0.0 };
             let moved: Vec<Vec3> = few.iter().map(|p| tried.map(p)).collect();
             let held: Vec<Vec3> = few_held.iter().map(|p| tried.map(p)).collect();
-            let start = middle - Shape::middle(moved.iter().copied());
+            let start = centre - Shape::centre(moved.iter().copied());
             let mut best = (f64::MIN, start);
             for (x, y) in (-MOVES..=MOVES).flat_map(|y| (-MOVES..=MOVES).map(move |x| (x, y))) {
                 let shift = start + Vec3::new(x as f64, y as f64, 0.0) * 0.01;

@@ -366,8 +366,8 @@ fn standing_plane(bodies: &[Vec<Vec3>], eye: &Vec3) -> Option<Plane> {
     // The mean distance from the median, because one body may stand on another.
     let spread = |normal: &Vec3| {
         let mut heights = lowest(normal);
-        let middle = median(&mut heights).unwrap_or(f64::NAN);
-        (heights.iter().map(|h| (h - middle).abs()).sum::<f64>() / heights.len() as f64, middle)
+        let median_height = median(&mut heights).unwrap_or(f64::NAN);
+        (heights.iter().map(|h| (h - median_height).abs()).sum::<f64>() / heights.len() as f64, median_height)
     };
     let mut best = eye.try_normalize(1e-9)?;
     let mut step = FIRST_STEP;

@@ -143,8 +143,8 @@ pub(super) fn anchor(
         |t: &Template| SeenPatch::of_patch(&TemplateSurface::new(t, drawn_size).patch(0.0, size, side));
     // The region is centred on the object's reference point, even if that is hidden.
     let (low, high) = mesh.bounding_box();
-    let middle = camera_from_object.transform_point(&((low + high) * 0.5));
-    let toward = Roi { centre: middle }.camera_from_roi().inverse() * *camera_from_object;
+    let box_centre = camera_from_object.transform_point(&((low + high) * 0.5));
+    let toward = Roi { centre: box_centre }.camera_from_roi().inverse() * *camera_from_object;
     let exact = draw(toward.rotation())?;
     let reference = |t: &Template| t.view_from_object.inverse().transform_point(&Vec3::zeros());
     let roi = Roi { centre: camera_from_object.transform_point(&reference(&exact)) };

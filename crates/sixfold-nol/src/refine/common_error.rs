@@ -77,8 +77,8 @@ impl Shared<'_, '_> {
             if squares.is_empty() {
                 return 1.0;
             }
-            let middle = squares.len() / 2;
-            (*squares.select_nth_unstable_by(middle, f64::total_cmp).1).sqrt().max(0.01)
+            let half = squares.len() / 2;
+            (*squares.select_nth_unstable_by(half, f64::total_cmp).1).sqrt().max(0.01)
         });
         let (mut sum, mut weight) = (0.0, 0.0);
         for (square, w) in rows.iter().flatten() {

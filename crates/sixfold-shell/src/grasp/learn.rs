@@ -106,7 +106,7 @@ impl TestObject {
         let (member, rest) = self.made.as_ref()?;
         let member_from_camera = (*camera_from_object * rest.rotation()).inverse();
         let part_at = |p: &Vec3| member.part_at(&member_from_camera.transform_point(p));
-        let middle = part_at(&centre_between_pads(&grasp.camera_from_gripper));
+        let central_part = part_at(&centre_between_pads(&grasp.camera_from_gripper));
         let gripper_from_camera = grasp.camera_from_gripper.inverse();
         let held: Vec<&Vec3> = view
             .object
@@ -114,8 +114,8 @@ impl TestObject {
             .iter()
             .filter(|p| gripper.is_between_pads(&gripper_from_camera.transform_point(p), grasp.opening))
             .collect();
-        let same = held.iter().filter(|p| part_at(p) == middle).count();
-        (10 * same >= 7 * held.len()).then_some(middle)
+        let same = held.iter().filter(|p| part_at(p) == central_part).count();
+        (10 * same >= 7 * held.len()).then_some(central_part)
     }
 }
 
@@ -438,7 +438,7 @@ mod tests {
             points.iter().copied().filter(|p| member.part_at(p) == part).collect()
         };
         let handle = on("handle");
-        let middle = handle.iter().sum::<Vec3>() / handle.len() as f64;
+        let centre = handle.iter().sum::<Vec3>() / handle.len() as f64;
         let top = handle.iter().map(|p| p.z).fold(f64::MIN, f64::max);
         // The camera's frame is the object's.
         let view = GraspView {
@@ -459,9 +459,9 @@ mod tests {
             test_object.part(&Pose::identity(), &grasp, &view, &gripper)
         };
         // From behind across the handle, the tips a centimetre past its centre.
-        assert_eq!(part(middle + Vec3::x() * 0.01, Vec3::x()), Some("handle"));
+        assert_eq!(part(centre + Vec3::x() * 0.01, Vec3::x()), Some("handle"));
         // From above, the tips at the upper end of the handle, the body between the fingers.
-        let above = Vec3::new(middle.x, middle.y, top - 0.025);
+        let above = Vec3::new(centre.x, centre.y, top - 0.025);
         assert_eq!(part(above, -Vec3::z()), None);
         // Across the body before the handle.
         let body = on("body");

@@ -139,7 +139,7 @@ impl Cutout {
         if points.is_empty() {
             return None;
         }
-        let middle = [x_sum / sum, y_sum / sum];
+        let centroid = [x_sum / sum, y_sum / sum];
         let turn = uniform(random, [-std::f32::consts::PI, std::f32::consts::PI]);
         let direction = uniform(random, [0.0, std::f32::consts::TAU]);
         let (dy, dx) = direction.sin_cos();
@@ -163,7 +163,7 @@ impl Cutout {
         let side = uniform(random, [-0.2, 0.2]) * longest;
         let places = (0..12).map(|i| {
             let r = farthest * (1.0 - (i as f32 + random.random::<f32>()) / 12.0);
-            [middle[0] + dx * r - dy * side, middle[1] + dy * r + dx * side]
+            [centroid[0] + dx * r - dy * side, centroid[1] + dy * r + dx * side]
         });
         let centre = places
             .map(|centre| (centre, (hides(centre) - fraction).abs()))

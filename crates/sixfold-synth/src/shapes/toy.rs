@@ -54,8 +54,8 @@ fn standing(mesh: &Mesh, diameter: f64) -> Result<Mesh, MeshError> {
         mesh = wider.scaled(diameter / wider.diameter());
     }
     let (low, high) = mesh.bounding_box();
-    let middle = (low + high) * 0.5;
-    Ok(mesh.transformed(&Pose::from_translation(-Vec3::new(middle.x, middle.y, low.z))))
+    let centre = (low + high) * 0.5;
+    Ok(mesh.transformed(&Pose::from_translation(-Vec3::new(centre.x, centre.y, low.z))))
 }
 
 /// Body, head and attached parts, the same on both sides of the plane y = 0.
@@ -201,9 +201,9 @@ fn tool(random: &mut impl Rng) -> Result<Vec<Mesh>, MeshError> {
     let end = grip.vertices().last().copied().unwrap_or_else(Vec3::z);
     let across = between(random, 0.3, 0.8);
     let thick = between(random, 0.15, 0.35);
-    let middle = Pose::from_translation(end);
+    let at_end = Pose::from_translation(end);
     let head = if random.random::<f64>() < 0.5 {
-        block(&Vec3::new(across, thick, between(random, 0.12, 0.35)), &middle)?
+        block(&Vec3::new(across, thick, between(random, 0.12, 0.35)), &at_end)?
     } else {
         let turn = UnitQuaternion::from_axis_angle(&Vector3::y_axis(), FRAC_PI_2);
         let kind = [Kind::Lathed, Kind::Superquadric, Kind::Bar][random.random_range(0..3usize)];
@@ -310,14 +310,14 @@ fn block(size: &Vec3, pose: &Pose) -> Result<Mesh, MeshError> {
 /// third of its length; `centred` keeps it in the plane y = 0.
 fn attach(parent: &Mesh, direction: &Vec3, part: &Mesh, centred: bool, random: &mut impl Rng) -> Mesh {
     let (low, high) = parent.bounding_box();
-    let middle = (low + high) * 0.5;
+    let centre = (low + high) * 0.5;
     let direction = direction.try_normalize(1e-9).unwrap_or_else(Vec3::z);
-    let mut best = (f64::NEG_INFINITY, middle, direction);
+    let mut best = (f64::NEG_INFINITY, centre, direction);
     for face in 0..parent.faces().len() {
         let [a, b, c] = parent.triangle(face);
         let Some(normal) = (b - a).cross(&(c - a)).try_normalize(1e-12) else { continue };
         let place = (a + b + c) / 3.0;
-        let along = (place - middle).try_normalize(1e-9).map_or(-1.0, |d| d.dot(&direction));
+        let along = (place - centre).try_normalize(1e-9).map_or(-1.0, |d| d.dot(&direction));
         if along > best.0 {
             best = (along, place, normal);
         }
