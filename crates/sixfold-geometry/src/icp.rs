@@ -232,9 +232,9 @@ pub fn icp(
         for _ in 0..level.iterations {
             let mut equations = NormalEquations::default();
             let mut squares = 0.0;
-            let mut looked = 0;
+            let mut examined = 0;
             for i in (0..source.len()).step_by(level.stride) {
-                looked += 1;
+                examined += 1;
                 let p = pose.transform_point(&source.points[i]);
                 let Some((q, n)) = target.partner(&p, level.rejection_distance) else { continue };
                 if with_normals && pose.transform_direction(&source.normals[i]).dot(&n) < cosine {
@@ -250,7 +250,7 @@ pub fn icp(
             if equations.count < options.min_correspondences {
                 return Err(IcpError::TooFewCorrespondences {
                     found: equations.count,
-                    points: looked,
+                    points: examined,
                     distance: level.rejection_distance,
                     needed: options.min_correspondences,
                 });

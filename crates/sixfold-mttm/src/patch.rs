@@ -37,7 +37,7 @@ impl Patch {
         side: usize,
         seen: impl Fn(usize) -> bool,
     ) -> Patch {
-        Patch::of_cells(&roi.look(scene, size, side, seen), size, side)
+        Patch::of_cells(&roi.cells_on_grid(scene, size, side, seen), size, side)
     }
 
     /// Cells of a region of `size` metres, as [`Roi::look`] returns them.

@@ -39,11 +39,11 @@ impl Roi {
     /// The cells, row by row. `size` is the region's side in metres; pixels (by their number in the image) for which `seen` is
     /// false are unknown.
     pub fn cells(&self, scene: &DepthRegion, size: f64, seen: impl Fn(usize) -> bool) -> Vec<Cell> {
-        self.look(scene, size, GRID, seen)
+        self.cells_on_grid(scene, size, GRID, seen)
     }
 
     /// The same on a grid of `grid x grid` cells.
-    pub fn look(
+    pub fn cells_on_grid(
         &self,
         scene: &DepthRegion,
         size: f64,

@@ -7,7 +7,7 @@ use rayon::prelude::*;
 use sixfold_mesh::Mesh;
 
 use crate::maps::Maps;
-use crate::refine::{Common, Light, Shown, look};
+use crate::refine::{Common, Light, PointSamples, sample_points};
 use crate::source::SourceView;
 use crate::surface::outwards;
 
@@ -25,13 +25,13 @@ const MIN_OPINION: f32 = 1.2;
 pub fn leave_out_what_differs(sources: &mut [SourceView], mesh: &Mesh) -> Vec<f64> {
     let surface = mesh.sample_surface(POINTS, 1);
     let normals = outwards(mesh, &surface.normals);
-    let raw: Vec<Shown> = sources
+    let raw: Vec<PointSamples> = sources
         .par_iter()
         .map(|source| {
             let maps = Maps::of_patch(&source.patch, BLUR);
             let allowed: Vec<f32> =
                 source.visible.data.iter().map(|v| f32::from(u8::from(*v > 0.5))).collect();
-            look(source, &maps, &allowed, &surface.points, &normals)
+            sample_points(source, &maps, &allowed, &surface.points, &normals)
         })
         .collect();
     let mut lit = raw.clone();

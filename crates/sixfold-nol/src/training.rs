@@ -280,9 +280,9 @@ impl Training for NolTraining {
         if let Some(critic) = &mut self.critic {
             // Pixels that no source shows are left out of both.
             let (image, target) = (out.image * out.mask.clone(), out.target * out.mask);
-            let told = critic.step(image.clone().detach(), target, number_of_step, rate, &self.device);
+            let critic_loss = critic.step(image.clone().detach(), target, number_of_step, rate, &self.device);
             let adversarial = critic.generator_loss(image);
-            losses.extend([("discriminator", told), ("adversarial", number(&adversarial))]);
+            losses.extend([("discriminator", critic_loss), ("adversarial", number(&adversarial))]);
             sum = sum + adversarial * self.options.adversarial;
         }
         self.learner.descend(rate, sum);

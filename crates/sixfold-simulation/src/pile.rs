@@ -133,7 +133,7 @@ pub fn drop_objects(
         falling.push((body, object));
     }
     let mut last: Vec<Option<Pose>> = vec![None; parts.len()];
-    for look in 0..PATIENCE.1 {
+    for iteration in 0..PATIENCE.1 {
         for _ in 0..STEPS {
             world.step();
         }
@@ -147,7 +147,7 @@ pub fn drop_objects(
             last[object.number] = Some(pose);
             // `!(a < b)` also removes objects whose position is NaN.
             let away = !(centre.xy().norm() < options.reach) || centre.z < 0.0;
-            if away || (!rests && look == PATIENCE.0) {
+            if away || (!rests && iteration == PATIENCE.0) {
                 world.remove_body(body);
                 all_rest = false;
                 continue;

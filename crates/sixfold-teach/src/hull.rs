@@ -94,7 +94,7 @@ mod tests {
         let (beside, centre) = (Vec3::new(0.015, 0.0, 0.0), Vec3::zeros());
         assert!(at(&masks, beside) < -0.003 && at(&masks, centre) < -0.015);
         masks[3] = square(10.0, false);
-        assert!(at(&masks, beside) > 0.003, "15 mm from the middle is 5 mm outside the narrow mask");
+        assert!(at(&masks, beside) > 0.003, "15 mm from the centre is 5 mm outside the narrow mask");
         masks[3] = square(20.0, true);
         assert!(at(&masks, centre) < -0.015, "a hole in one mask is none");
         masks[7] = square(20.0, true);

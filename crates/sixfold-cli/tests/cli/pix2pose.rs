@@ -200,14 +200,14 @@ fn a_preset_brings_its_thresholds_and_symmetries() {
     assert!(lmo.card().data.contains("parameters for lmo"), "{}", lmo.card().data);
     assert!(!quiet.contains("appendix A"), "{quiet}");
     // Object 1 of T-LESS is symmetric about z; this one, which is not a cylinder, is not.
-    let (tless, told) = model("tless");
+    let (tless, output) = model("tless");
     assert_eq!(tless.objects()[0].thresholds, [0.1]);
     assert!(
-        told.contains(
+        output.contains(
             "0 discrete and 1 continuous symmetries of appendix A in place of the dataset's 0 and 0"
         )
     );
-    assert!(told.contains("warning: object 1: under a declared symmetry"), "{told}");
+    assert!(output.contains("warning: object 1: under a declared symmetry"), "{output}");
     assert_eq!(model("bop").0.objects()[0].thresholds, [0.15, 0.25, 0.35]);
 }
 

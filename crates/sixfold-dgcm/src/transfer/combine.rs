@@ -384,7 +384,7 @@ mod tests {
         let rank =
             |outcomes: &OutcomeModel| rank_by_outcome(&[end, centre], &[], &clusters, &fitter, outcomes);
         let untaught = rank(&OutcomeModel::default());
-        assert!(untaught[0].grasp.camera_from_gripper.translation().x < 0.06, "nearer to the middle");
+        assert!(untaught[0].grasp.camera_from_gripper.translation().x < 0.06, "nearer to the centre");
         let taught = rank(&OutcomeModel::learn(&attempts, &gripper.name));
         assert_eq!(taught.len(), 2);
         let depth = |r: &Ranked| fitter.describe(&r.grasp).overlap;
@@ -437,7 +437,7 @@ mod tests {
         );
         let places: Vec<f64> =
             ranked.iter().map(|r| r.grasp.camera_from_gripper.translation().x.signum()).collect();
-        assert_eq!(places, [-1.0, 1.0], "the left end, then the transferred one; the middle is left out");
+        assert_eq!(places, [-1.0, 1.0], "the left end, then the transferred one; the centre is left out");
         assert_eq!((ranked[0].kind, ranked[1].kind), (Kind::Geometry, Kind::Experience));
     }
 

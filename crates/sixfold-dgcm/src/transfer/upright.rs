@@ -335,9 +335,9 @@ mod tests {
     #[test]
     fn without_a_table_nothing_is_said() {
         let [a, b] = [1, 2].map(|seed| seen(Family::Mug, seed, 0.0));
-        let lying = Crop { table: None, ..b.crop.clone() };
-        assert!(upright(&Shape::new(&a.crop), &Shape::new(&lying), &[]).is_empty());
-        assert!(upright(&Shape::new(&lying), &Shape::new(&a.crop), &[]).is_empty());
+        let without_table = Crop { table: None, ..b.crop.clone() };
+        assert!(upright(&Shape::new(&a.crop), &Shape::new(&without_table), &[]).is_empty());
+        assert!(upright(&Shape::new(&without_table), &Shape::new(&a.crop), &[]).is_empty());
         assert!(!upright(&Shape::new(&b.crop), &Shape::new(&a.crop), &[]).is_empty());
     }
 }

@@ -152,7 +152,7 @@ pub(super) fn anchor(
     let rotation = roi_from_object.rotation();
 
     let kept = options.kept_side();
-    let cells = roi.look(scene, size * kept as f64 / side as f64, kept, |_| true);
+    let cells = roi.cells_on_grid(scene, size * kept as f64 / side as f64, kept, |_| true);
     let mask = looks_at(scene, &roi, size * kept as f64 / side as f64, kept, |p| visible.as_slice()[p]);
     let positives: Vec<Positive> = (0..options.positives)
         .filter_map(|_| {
@@ -194,7 +194,8 @@ pub(super) fn without_object(
     options: &AnchorOptions,
 ) -> Anchor {
     let (size, kept) = (REACH * diameter, options.kept_side());
-    let cells = Roi { centre: *point }.look(scene, size * kept as f64 / options.side as f64, kept, |_| true);
+    let cells =
+        Roi { centre: *point }.cells_on_grid(scene, size * kept as f64 / options.side as f64, kept, |_| true);
     Anchor {
         object: None,
         region: SeenPatch::of_cells(&cells, size, kept),
@@ -212,7 +213,7 @@ fn looks_at(
     side: usize,
     of_kind: impl Fn(usize) -> bool,
 ) -> Vec<bool> {
-    roi.look(scene, size, side, of_kind).iter().map(|c| *c != UNKNOWN).collect()
+    roi.cells_on_grid(scene, size, side, of_kind).iter().map(|c| *c != UNKNOWN).collect()
 }
 
 /// A random rotation as occurs between a view and the templates near it.

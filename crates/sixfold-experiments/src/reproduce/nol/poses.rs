@@ -140,7 +140,7 @@ pub(super) fn refine(
             let going =
                 |_, _| !sixfold_shell::progress::interrupted().load(std::sync::atomic::Ordering::SeqCst);
             let refined = refine_scene(&scene, &meshes, &options, &going)?;
-            sixfold_shell::progress::check_interrupt(super::GO_ON)?;
+            sixfold_shell::progress::check_interrupt(super::RESUME_HINT)?;
             let reports = refined.sources;
             (
                 reports.iter().map(|r| r.camera_from_object).collect(),
