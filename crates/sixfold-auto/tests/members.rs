@@ -200,7 +200,7 @@ fn two_poses_that_look_alike_are_both_said() {
 }
 
 #[test]
-fn who_cannot_answer_is_left_out_and_said() {
+fn members_that_cannot_run_are_left_out_and_reported() {
     let (depth, _) = images(&wedge());
     let camera = camera();
     let query = Query { depth: Some(&depth), ..Query::new(&camera) };

@@ -311,7 +311,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn tags_and_ruler_are_on_the_sheet_and_apart() {
+    fn tags_and_ruler_are_on_the_sheet_without_overlap() {
         for paper in Paper::ALL {
             let board = Board::new(paper);
             let (width, height) = paper.size();

@@ -112,7 +112,7 @@ fn a_camera_is_calibrated_and_poses_are_exact() {
 }
 
 #[test]
-fn what_cannot_be_used_is_refused_with_the_reason() {
+fn unusable_photographs_are_refused_with_the_reason() {
     let board = Board::new(Paper::A4);
     let truth = pose(0.4, 0.3, 0.45);
     let good = photograph(&board, &camera(), &truth, &Conditions::default(), 3);

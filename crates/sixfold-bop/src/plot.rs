@@ -163,7 +163,7 @@ mod tests {
     }
 
     #[test]
-    fn the_thick_line_is_where_the_recall_is() {
+    fn the_thick_line_is_at_the_recall() {
         for recall in [0.25, 0.75] {
             let picture = draw_recall_curves(&evaluation(recall));
             // The curve is level in the right half of the first panel: scan the column at three quarters of its
@@ -181,7 +181,7 @@ mod tests {
     }
 
     #[test]
-    fn a_picture_is_written() {
+    fn a_plot_is_written() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("curves.png");
         write_recall_curves(&path, &evaluation(0.5)).unwrap();

@@ -255,7 +255,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn the_tree_finds_what_brute_force_finds(points in points(), by in pose()) {
+        fn the_tree_agrees_with_brute_force(points in points(), by in pose()) {
             let model = ModelPoints::new(&points).unwrap();
             let brute: f64 = points.iter().map(|p| {
                 let q = by.transform_point(p);

@@ -217,7 +217,7 @@ mod tests {
     }
 
     #[test]
-    fn locations_lie_on_their_objects_near_the_middle() {
+    fn locations_are_on_their_objects_near_the_centre() {
         let annotation = annotation();
         let config = DetectorConfig::compact(3);
         let targets = Targets::new(&annotation, &config);
@@ -246,7 +246,7 @@ mod tests {
     }
 
     #[test]
-    fn masks_are_shares_of_blocks() {
+    fn masks_are_fractions_of_blocks() {
         let targets = Targets::new(&annotation(), &DetectorConfig::compact(3));
         let mask = &targets.masks[1];
         assert_eq!((mask.corner, mask.size), ([13, 3], [19, 21]));

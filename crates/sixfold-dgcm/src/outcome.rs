@@ -189,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn it_learns_what_fails_with_this_hand_only() {
+    fn it_learns_failures_of_this_gripper_only() {
         // A gripper that loses objects held away from their centre, whatever the contacts: 3 of 4 times against 1 of 10.
         let mut random = ChaCha8Rng::seed_from_u64(3);
         let attempts: Vec<Attempt> = (0..200)
@@ -212,7 +212,7 @@ mod tests {
     }
 
     #[test]
-    fn walls_and_middles_are_learnt_apart() {
+    fn walls_and_centres_are_learned_separately() {
         // At a wall the pads must reach far, at the centre they must not: a sum of both inputs cannot express this.
         let of = |wall: bool, deep: bool| GraspDescription {
             lever: if wall { 0.045 } else { 0.0 },

@@ -739,7 +739,7 @@ mod tests {
     }
 
     #[test]
-    fn two_who_change_an_object_at_once_are_one_after_the_other_and_readers_see_one_or_the_other() {
+    fn concurrent_changes_are_serialised_and_readers_see_a_consistent_object() {
         let root = tempfile::tempdir().unwrap();
         let store = ObjectStore::new(root.path());
         add(&store, 1.0, false, Ok(())).unwrap();
@@ -786,7 +786,7 @@ mod tests {
     }
 
     #[test]
-    fn a_broken_file_of_the_store_is_an_error_that_says_how_to_make_it_again() {
+    fn a_broken_file_of_the_store_is_an_error_with_advice() {
         let root = tempfile::tempdir().unwrap();
         let store = ObjectStore::new(root.path());
         add(&store, 1.0, false, Ok(())).unwrap();

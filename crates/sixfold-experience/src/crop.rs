@@ -292,7 +292,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_cut_out_says_why() {
+    fn errors_explain_why_a_crop_fails() {
         let (depth, camera, mask) = scene();
         let empty = Mask::filled(640, 480, false);
         let error = Crop::new(&depth, &camera, &empty, &CropOptions::compact()).unwrap_err();

@@ -69,7 +69,7 @@ mod tests {
     use sixfold_geometry::{Image, Mask};
 
     #[test]
-    fn a_quarter_turn_moves_points_to_where_they_project() {
+    fn a_rotation_by_90_degrees_moves_points_to_their_projections() {
         let camera = Camera::new(575.0, 575.0, 319.5, 239.5, 640, 480).unwrap();
         let inside = |x: usize, y: usize| (380..480).contains(&x) && (260..300).contains(&y);
         let depth = Image::from_fn(640, 480, |x, y| if inside(x, y) { 0.7 + 0.0004 * x as f32 } else { 0.0 });

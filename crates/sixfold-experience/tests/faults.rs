@@ -168,7 +168,7 @@ fn one_broken_row_is_named_costs_itself_alone_and_can_be_removed() {
 }
 
 #[test]
-fn what_is_left_of_a_truncated_store_is_saved() {
+fn readable_rows_of_a_truncated_store_are_saved() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("a.db");
     {

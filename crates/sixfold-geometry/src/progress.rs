@@ -34,7 +34,7 @@ mod tests {
     }
 
     #[test]
-    fn a_closure_is_told_of_every_part_and_may_stop_it() {
+    fn a_closure_receives_every_part_and_can_stop_it() {
         let reported = AtomicUsize::new(0);
         let until = |last: usize| {
             reported.store(0, Ordering::Relaxed);

@@ -336,7 +336,7 @@ mod tests {
     }
 
     #[test]
-    fn truncated_lying_and_foreign_files_are_named() {
+    fn errors_name_truncated_inconsistent_and_foreign_files() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("000007.png");
         let png = depth_png();

@@ -777,7 +777,7 @@ mod tests {
     }
 
     #[test]
-    fn lying_files_are_explained_without_taking_memory() {
+    fn files_with_wrong_counts_are_explained_without_allocation() {
         for (from, to, names) in [
             (
                 "vertex 4",

@@ -178,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn lying_files_are_explained() {
+    fn files_with_wrong_counts_are_explained() {
         let mut wrong_count = binary(&[b' '; 80]);
         wrong_count[80..84].copy_from_slice(&4_000_000_000u32.to_le_bytes());
         let mut nan = binary(&[b' '; 80]);

@@ -210,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_a_view_is_refused() {
+    fn invalid_views_are_refused() {
         let (depth, mask, _) = ball();
         let camera = camera();
         let view = DepthView { depth: &depth, camera: &camera, mask: &mask, camera_from_object: None };

@@ -171,7 +171,7 @@ mod tests {
     }
 
     #[test]
-    fn every_point_of_a_template_lies_on_the_mesh() {
+    fn every_point_of_a_template_is_on_the_mesh() {
         let templates = ObjectTemplates::from_mesh(&brick(), &TemplateOptions::default()).unwrap();
         assert_eq!(templates.templates.len(), 305);
         for t in templates.templates.iter().step_by(17) {

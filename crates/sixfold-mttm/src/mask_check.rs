@@ -278,7 +278,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_large_mask_takes_in_is_left_out() {
+    fn surroundings_in_a_large_mask_are_left_out() {
         for bumpy in [false, true] {
             let (depth, mask) = scene(bumpy);
             let large = mask.grown(3);

@@ -336,7 +336,7 @@ mod tests {
     }
 
     #[test]
-    fn the_right_turn_matches_best() {
+    fn the_right_rotation_matches_best() {
         let object = roof();
         let matcher = Matcher::new(&object, &MatchOptions::default());
         assert_eq!(matcher.entries().len(), 7);
@@ -348,7 +348,7 @@ mod tests {
     }
 
     #[test]
-    fn hidden_cells_say_little_and_cells_seen_through_say_no() {
+    fn hidden_cells_count_little_and_cells_seen_through_contradict() {
         let object = roof();
         let matcher = Matcher::new(&object, &MatchOptions::default());
         let seen = cells(0.0);

@@ -281,7 +281,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_asked_together_is_answered_as_if_alone() {
+    fn a_batch_gives_the_same_as_single_queries() {
         let model = model();
         let patches: Vec<Patch> = (0..70).map(patch).collect();
         let encoded = model.encode(&patches.iter().collect::<Vec<_>>());
@@ -301,7 +301,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_not_taught_is_not_used() {
+    fn untrained_outputs_are_not_used() {
         let network = Network::Compact(CompactConfig.init(1, &Device::flex()));
         let output = |training: serde_json::Value| {
             let extra = serde_json::json!({ "training": training });

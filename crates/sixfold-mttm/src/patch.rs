@@ -130,7 +130,7 @@ mod tests {
     }
 
     #[test]
-    fn a_template_looks_like_the_scene_it_is_seen_in() {
+    fn a_template_resembles_its_object_in_a_scene() {
         let mesh = wedge();
         let object = ObjectTemplates::from_mesh(&mesh, &TemplateOptions::default()).unwrap();
         let size = REACH * object.diameter;

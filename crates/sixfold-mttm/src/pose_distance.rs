@@ -79,7 +79,7 @@ mod tests {
     }
 
     #[test]
-    fn a_turn_that_cannot_be_seen_is_no_distance() {
+    fn an_invisible_rotation_is_no_distance() {
         let round = prism(48, |_| 0.04);
         assert_eq!(distance(&round, 1.0), 0.0);
         // A blade: from its narrow side it covers half as many pixels.

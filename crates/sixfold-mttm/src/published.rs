@@ -291,7 +291,7 @@ mod tests {
     }
 
     #[test]
-    fn the_centroid_lies_on_what_most_of_the_mask_shows() {
+    fn the_centroid_is_on_the_surface_of_most_of_the_mask() {
         let scene = scene();
         let mask: Vec<f32> = (0..MAP * MAP)
             .map(|i| f32::from(u8::from((3..11).contains(&(i % MAP)) && (3..11).contains(&(i / MAP)))))

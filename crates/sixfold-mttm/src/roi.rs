@@ -223,7 +223,7 @@ mod tests {
     }
 
     #[test]
-    fn a_region_sees_its_surroundings_relative_to_its_centre() {
+    fn a_region_describes_its_surroundings_relative_to_its_centre() {
         let scene = scene();
         let centre = scene.camera().unproject(&Vec2::new(150.0, 340.0), 0.6);
         let cells = Roi { centre }.cells(&scene, 0.06, |_| true);
@@ -238,7 +238,7 @@ mod tests {
     }
 
     #[test]
-    fn a_turn_to_a_ray_is_as_small_as_can_be() {
+    fn a_rotation_to_a_ray_is_minimal() {
         for p in [Vec3::z(), Vec3::new(0.3, -0.2, 0.9), Vec3::new(-0.5, 0.0, 0.5)] {
             let r = ray_rotation(&p);
             assert!((r * Vec3::z() - p.normalize()).norm() < 1e-12);

@@ -112,7 +112,7 @@ mod tests {
     }
 
     #[test]
-    fn the_object_stands_upright_in_the_view() {
+    fn the_object_is_upright_in_the_view() {
         for d in view_directions(ViewCoverage::Around) {
             let r = view_rotation(&d);
             // The camera is in the given direction, on the view's negative z axis.

@@ -127,7 +127,7 @@ fn found_from_all_sides_with_its_mask() {
 
 /// No alignment repairs a match here: its turn in the image has to be the scene's, not the opposite one.
 #[test]
-fn the_best_match_has_the_turn_of_the_image() {
+fn the_best_match_has_the_rotation_of_the_image() {
     let mesh = part();
     let templates = ObjectTemplates::from_mesh(&mesh, &TemplateOptions::default()).unwrap();
     let matcher = Matcher::new(&templates, &MatchOptions::default());
@@ -148,7 +148,7 @@ fn the_best_match_has_the_turn_of_the_image() {
 
 /// Before any alignment: the network's word on a region beside the object's centre, paired with the nearest of its templates.
 #[test]
-fn the_network_says_where_and_how_an_object_lies_and_which_pairs_match() {
+fn the_network_predicts_offset_rotation_and_matching() {
     let mesh = part();
     let object = ObjectTemplates::from_mesh(&mesh, &TemplateOptions::default()).unwrap();
     let entries = Matcher::new(&object, &MatchOptions::default()).entries().to_vec();
@@ -298,7 +298,7 @@ fn a_hidden_half_does_not_shift_the_pose() {
 }
 
 #[test]
-fn what_is_not_there_is_not_surely_found() {
+fn absent_objects_are_not_found_with_high_confidence() {
     let box_alone = cuboid([-0.1, -0.07, 0.0], [0.1, 0.07, 0.09]);
     let sure = |found: &[MttmEstimate]| found.first().map_or(0.0, |e| e.confidence);
     for object in both_ways(known(true)) {

@@ -366,7 +366,7 @@ mod tests {
     }
 
     #[test]
-    fn curves_are_drawn_where_the_values_are() {
+    fn curves_are_plotted_at_their_values() {
         let dir = tempfile::tempdir().unwrap();
         let png = dir.path().join("curves.png");
         let mut log: Vec<_> = (1..=3000).map(record).collect();

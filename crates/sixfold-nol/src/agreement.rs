@@ -99,7 +99,7 @@ mod tests {
     use crate::refine::tests::photographs;
 
     #[test]
-    fn what_stands_before_the_object_in_one_photograph_is_left_out() {
+    fn occluders_in_one_photograph_are_left_out() {
         let (mesh, truth, list) = photographs(40, [0.0, 0.0], 5);
         // A bright occluder hides half of the block in the first one.
         let side = 96;

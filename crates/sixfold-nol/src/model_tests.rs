@@ -119,7 +119,7 @@ fn exact_poses_give_the_truth_whatever_the_weights() {
 }
 
 #[test]
-fn what_no_source_sees_is_said() {
+fn unseen_pixels_are_reported() {
     let mesh = printed_box();
     let model = model(IntegratorKind::Lstm);
     let target = TargetSurface::new(&mesh, &camera(), &pose(0.0));

@@ -172,7 +172,7 @@ mod tests {
     use sixfold_geometry::nalgebra::UnitQuaternion;
 
     #[test]
-    fn the_one_that_shows_what_is_missing_comes_next() {
+    fn the_photograph_that_adds_missing_surface_comes_next() {
         let shown = vec![vec![1.0, 1.0, 1.0, 0.0], vec![1.0, 1.0, 0.0, 0.0], vec![0.0, 0.0, 0.0, 0.8]];
         assert_eq!(choose_by_surface(&shown, None, 2, 0.0), vec![0, 2]);
         assert_eq!(choose_by_surface(&shown, Some(&[true, true, false, false]), 1, 0.0), vec![0]);

@@ -366,7 +366,7 @@ mod tests {
     }
 
     #[test]
-    fn the_perceptual_distance_sees_blur_and_not_what_lies_beside() {
+    fn the_perceptual_distance_reacts_to_blur_within_the_mask_only() {
         let judge = ImageSimilarity::new().unwrap();
         let mask = Mask::from_fn(32, 32, |x, y| (8..24).contains(&x) && (8..24).contains(&y));
         let board = patch(|x, y| if (x / 4 + y / 4) % 2 == 0 { 0.8 } else { 0.2 });
@@ -387,7 +387,7 @@ mod tests {
     }
 
     #[test]
-    fn a_coarse_grid_knows_shares_of_the_mask() {
+    fn a_coarse_grid_holds_fractions_of_the_mask() {
         let mask = Mask::from_fn(4, 4, |x, y| x == 0 || y == 3);
         assert_eq!(cover(&mask, [2, 2]), vec![0.5, 0.0, 0.75, 0.5]);
     }

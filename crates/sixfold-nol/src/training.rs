@@ -359,7 +359,7 @@ mod tests {
     }
 
     #[test]
-    fn it_goes_on_where_it_stopped() {
+    fn it_resumes_from_its_last_checkpoint() {
         let textures = Backgrounds::procedural();
         let options = options(6);
         let go = |folder: &Path, stop_at: Option<u64>, sample_threads: usize| {

@@ -219,7 +219,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn distances_count_as_far_as_they_stand_out_of_their_scatter() {
+    fn distances_count_if_significant_against_their_scatter() {
         let shifts: Vec<Vec2> = [0.9, 1.0, 1.1, 1.2, 30.0].map(|x| Vec2::new(x, -x)).to_vec();
         let around = |centre: f64, scatter: f64| -> Vec<f64> {
             (-4..=4).map(|i| centre + 0.25 * scatter * f64::from(i)).collect()

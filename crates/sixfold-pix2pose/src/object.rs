@@ -241,7 +241,7 @@ mod tests {
     }
 
     #[test]
-    fn a_quarter_turn_of_a_box_with_unequal_sides_is_applied_in_metres() {
+    fn a_rotation_by_90_degrees_of_a_box_with_unequal_sides_is_applied_in_metres() {
         let scale =
             BoundingBoxScale { centre: Vec3::new(0.01, -0.02, 0.0), half_size: Vec3::new(0.1, 0.2, 0.05) };
         let turn = Pose::exp(&[0.0, 0.0, 0.0, 0.0, 0.0, std::f64::consts::FRAC_PI_2].into());

@@ -184,7 +184,7 @@ mod tests {
     }
 
     #[test]
-    fn turns_are_about_the_middle_of_the_box() {
+    fn rotations_are_about_the_centre_of_the_box() {
         let info = info();
         let centre = info.min + 0.5 * info.size;
         let point = centre + Vec3::new(0.03, 0.01, 0.02);

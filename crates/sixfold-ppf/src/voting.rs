@@ -399,7 +399,7 @@ mod tests {
 
     /// Regression test: with a focal length of half a pixel the points are 12 km apart, and a grid of cells of 10 cm took 7.5 GB.
     #[test]
-    fn points_kilometres_apart_take_a_bounded_grid_with_the_same_partners() {
+    fn points_kilometres_apart_take_a_bounded_grid_with_the_same_neighbours() {
         let mut random = ChaCha8Rng::seed_from_u64(5);
         let mut points: Vec<Vec3> =
             (0..300).map(|_| Vec3::from_fn(|_, _| random.random_range(0.0..0.5))).collect();

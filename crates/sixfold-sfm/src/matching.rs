@@ -129,7 +129,7 @@ mod tests {
     }
 
     #[test]
-    fn the_rotation_that_matches_most_is_taken() {
+    fn the_rotation_with_most_matches_is_used() {
         let a = features(&[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]);
         let mut b = features(&[[-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]]);
         assert_eq!(matched(&[a.clone(), b.clone()], 0.5, &()).unwrap()[0].matches, [(1, 1)]);

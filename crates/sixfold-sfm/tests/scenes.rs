@@ -142,7 +142,7 @@ fn a_camera_that_is_a_guess_is_found_too() {
 }
 
 #[test]
-fn a_focal_length_that_the_camera_names_helps_with_a_lens_that_nobody_guesses() {
+fn a_focal_length_in_the_file_helps_with_an_unusual_lens() {
     // The telephoto lens of a phone: 77 mm on 35 mm film.
     let truth = Camera::new(2278.0, 2278.0, 511.5, 383.5, 1024, 768).unwrap();
     let scene = Scene::new(around(12), truth, false, 0.5, 0.1);
@@ -230,7 +230,7 @@ fn a_photograph_with_few_matches_is_named_with_their_number() {
 }
 
 #[test]
-fn what_moved_between_photographs_is_left_out() {
+fn unrelated_photographs_are_left_out() {
     let mut scene = Scene::new(around(10), camera(), false, 0.3, 0.0);
     let mut random = stream(8, 0);
     scene.pixels[4]

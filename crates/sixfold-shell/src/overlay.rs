@@ -383,7 +383,7 @@ mod tests {
     }
 
     #[test]
-    fn a_mask_stands_for_an_object_without_a_mesh() {
+    fn a_mask_represents_an_object_without_a_mesh() {
         let pixels: Vec<u32> = (50..70).flat_map(|y| (60..90).map(move |x| y * 160 + x)).collect();
         let image = RgbImage::filled(160, 120, [0; 3]);
         let shape = Shape::Pixels(&pixels);

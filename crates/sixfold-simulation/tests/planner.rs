@@ -28,7 +28,7 @@ fn view_of(seen: &SimulatedView) -> GraspView {
 }
 
 #[test]
-fn most_first_proposals_on_simple_shapes_are_held() {
+fn most_first_proposals_on_simple_shapes_hold() {
     let shapes = [
         shapes::cuboid(Vec3::new(0.06, 0.1, 0.12)).unwrap(),
         shapes::cylinder(0.035, 0.1).unwrap(),
@@ -48,7 +48,7 @@ fn most_first_proposals_on_simple_shapes_are_held() {
 }
 
 #[test]
-fn the_far_side_of_a_can_is_assumed_where_it_is() {
+fn the_far_side_of_a_can_is_completed_at_its_place() {
     let seen = simulated(&shapes::cylinder(0.035, 0.1).unwrap(), &Pose::identity());
     let view = view_of(&seen);
     let whole = complete_by_mirrors(&view, &CompletionOptions::default());
@@ -65,7 +65,7 @@ fn the_far_side_of_a_can_is_assumed_where_it_is() {
 }
 
 #[test]
-fn every_grasp_fits_the_gripper_and_stands_clear_of_the_table() {
+fn every_grasp_fits_the_gripper_and_is_clear_of_the_table() {
     let seen = simulated(&shapes::cup(0.04, 0.1, 0.004).unwrap(), &Pose::identity());
     let view = view_of(&seen);
     let gripper = hand();
@@ -105,7 +105,7 @@ fn lifted(height: f64) -> Pose {
 }
 
 #[test]
-fn what_shows_no_object_is_refused_with_a_reason() {
+fn views_without_an_object_are_refused_with_a_reason() {
     let seen = simulated(&shapes::cylinder(0.035, 0.1).unwrap(), &Pose::identity());
     let (depth, camera) = (&seen.depth, &seen.camera);
     let options = ViewOptions::default();

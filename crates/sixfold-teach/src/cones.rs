@@ -217,7 +217,7 @@ mod tests {
     }
 
     #[test]
-    fn one_direction_or_masks_apart_give_none() {
+    fn one_direction_or_disjoint_masks_give_none() {
         let pose = looking_at(&Vec3::zeros(), 10.0, 30.0, 0.5, 0.0);
         let mask = ball(&Vec3::zeros(), &pose);
         assert!(volume(&[pose, pose], &[mask.clone(), mask.clone()], &[None, None]).is_none());

@@ -437,7 +437,7 @@ mod tests {
     }
 
     #[test]
-    fn a_length_between_marks_says_how_long_the_unit_is() {
+    fn a_length_between_marks_gives_the_scale() {
         let (mut scene, seen) = scene();
         let ends = [Vec3::new(0.1, 0.0, 0.0), Vec3::new(-0.1, 0.0, 0.0)];
         let length = marked_in(&scene, ends, &[0, 2]);
@@ -461,7 +461,7 @@ mod tests {
     }
 
     #[test]
-    fn depth_says_how_long_the_unit_is_but_for_borders_and_holes() {
+    fn depth_gives_the_scale_except_at_borders_and_holes() {
         let (scene, seen) = scene();
         // Depth of the patch at half the unit; every third pixel column is a hole, and a third of the image another surface.
         let depth_of = |i: usize| {

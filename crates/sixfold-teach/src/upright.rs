@@ -147,7 +147,7 @@ mod tests {
     }
 
     #[test]
-    fn the_frame_stands_on_the_table_wherever_the_reconstruction_lies() {
+    fn the_frame_is_on_the_table_for_any_frame_of_the_reconstruction() {
         let (points, poses) = scene();
         let scene_from_truth = Pose::exp(&[0.3, -2.0, 1.0, 1.0, -0.4, 2.0].into());
         let moved: Vec<Vec3> = points.iter().map(|p| scene_from_truth.transform_point(p)).collect();
@@ -161,7 +161,7 @@ mod tests {
     }
 
     #[test]
-    fn without_a_table_up_is_where_the_photographs_have_it() {
+    fn without_a_table_up_comes_from_the_photographs() {
         let (_, poses) = scene();
         let ball: Vec<Vec3> = (0..600)
             .map(|i| {

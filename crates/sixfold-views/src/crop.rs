@@ -164,7 +164,7 @@ mod tests {
     }
 
     #[test]
-    fn what_lies_beside_the_image_is_filled() {
+    fn pixels_outside_the_image_are_filled() {
         let camera = camera();
         let image = RgbImage::filled(640, 480, [255, 255, 255]);
         let bbox = Rect { x: -40.0, y: 200.0, width: 80.0, height: 80.0 };

@@ -198,7 +198,7 @@ mod tests {
     }
 
     #[test]
-    fn a_side_that_is_seen_alone_has_no_relief() {
+    fn a_single_visible_side_has_no_relief() {
         // Three sides of the box are visible; one if it faces the camera.
         let rotated = asked(&pose()).depth.unwrap().relief;
         assert!(rotated > 0.2, "{rotated}");

@@ -333,7 +333,7 @@ mod tests {
     }
 
     #[test]
-    fn an_edge_near_the_border_of_the_odds_says_where_it_is() {
+    fn an_edge_near_the_border_of_the_log_odds_shifts_the_border() {
         // With odds alone the border is where they change their sign.
         let alone = found(2.0, 0.0, 0.0);
         assert!((alone - 2.0).abs() < 0.3, "{alone}");

@@ -48,7 +48,7 @@ fn all_targets_are_estimated_and_score_well() {
 }
 
 #[test]
-fn a_cut_off_run_goes_on_to_the_same_result() {
+fn an_interrupted_run_resumes_to_the_same_result() {
     let tiny = Tiny::new(true);
     let csv = tiny.path().join("results.csv");
     sixfold(tiny.path(), ARGUMENTS).expect(0);

@@ -77,7 +77,7 @@ fn any_seed_finds_the_pose() {
 }
 
 #[test]
-fn a_table_prints_where_no_json_is_asked_for() {
+fn a_table_is_printed_without_json() {
     let case = OneImage::new();
     let run = sixfold(case.path(), &format!("{} --json poses.json", OneImage::ARGUMENTS)).expect(0);
     assert!(run.stdout.lines().any(|l| l.starts_with("part ")), "{}", run.stdout);

@@ -42,7 +42,7 @@ fn json_of(file: &Path) -> Value {
 }
 
 #[test]
-fn a_network_trained_on_three_pictures_finds_the_object_in_them() {
+fn a_network_trained_on_three_images_finds_the_object_in_them() {
     let tiny = Tiny::coloured();
     let trained = sixfold(tiny.path(), &format!("{} --json", train(160))).expect(0).json();
     assert_eq!((&trained["steps"], &trained["photographs"]), (&160.into(), &3.into()));
@@ -124,7 +124,7 @@ fn a_network_trained_on_three_pictures_finds_the_object_in_them() {
 }
 
 #[test]
-fn a_training_goes_on_and_is_not_mixed_with_another() {
+fn a_training_resumes_and_is_not_mixed_with_another() {
     let tiny = Tiny::coloured();
     fails(tiny.path(), &format!("{} --export", train(3)), &["trained", "no checkpoint"]);
     sixfold(tiny.path(), &train(3)).expect(0);

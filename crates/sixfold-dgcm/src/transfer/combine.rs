@@ -402,7 +402,7 @@ mod tests {
     }
 
     #[test]
-    fn on_a_part_what_holds_its_counterpart_comes_first() {
+    fn on_a_part_grasps_of_its_counterpart_come_first() {
         let view = bar();
         let gripper = Gripper::built_in("jaws-85").unwrap();
         let options = AntipodalOptions { completion: None, ..AntipodalOptions::default() };

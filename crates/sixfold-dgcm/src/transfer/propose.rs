@@ -401,7 +401,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_grasp_holds_is_looked_up_between_its_pads() {
+    fn held_surface_is_looked_up_between_the_pads() {
         // A plate of 12 x 4 cm at 0.7 m, whose left third was held in experience.
         let camera = Camera::new(575.0, 575.0, 159.5, 119.5, 320, 240).unwrap();
         let inside = |x: usize, y: usize| (110..209).contains(&x) && (103..136).contains(&y);

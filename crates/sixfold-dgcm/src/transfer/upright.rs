@@ -302,7 +302,7 @@ mod tests {
     }
 
     #[test]
-    fn a_handle_tells_more_of_a_turn_than_the_wall() {
+    fn a_handle_determines_the_yaw_better_than_the_wall() {
         let mug = seen(Family::Mug, 31, -0.3);
         let shape = Shape::new(&mug.crop);
         let ones = || vec![1.0; shape.points.len()];

@@ -474,7 +474,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_row_counts_what_was_not_found_as_wrong() {
+    fn a_row_counts_missing_poses_as_wrong() {
         let outcome =
             |object, iou, error| Outcomes { object, iou, error, confidence: None, seconds: [1.0, 0.5] };
         let image = |all: Vec<Outcomes>| Measured::from([("both".to_string(), all)]);
@@ -497,7 +497,7 @@ mod tests {
     }
 
     #[test]
-    fn the_error_is_a_share_of_the_diameter() {
+    fn the_error_is_a_fraction_of_the_diameter() {
         let vertices = vec![Vec3::zeros(), Vec3::x() * 0.1, Vec3::y() * 0.1, Vec3::z() * 0.1];
         let points = ModelPoints::new(&vertices).unwrap();
         let mesh = Mesh::new(vertices, vec![[0, 1, 2], [0, 2, 3]]).unwrap();

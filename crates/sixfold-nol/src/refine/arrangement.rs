@@ -132,7 +132,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn one_step_brings_cameras_and_objects_to_where_their_images_want_them() {
+    fn one_step_brings_cameras_and_objects_to_the_optimum() {
         let pairs = vec![[0, 0], [0, 1], [1, 0], [1, 1], [2, 0], [2, 1]];
         let camera = |x: f64, yaw: f64| Pose::exp(&[x, 0.02 * x, 0.8, 0.3, yaw, 0.1 * yaw].into());
         let cameras = [camera(0.1, 0.2), camera(-0.2, -0.5), camera(0.0, 1.0)];

@@ -236,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn an_object_alone_says_nothing() {
+    fn a_single_object_gives_no_evidence() {
         let pairs = [[0, 0], [1, 0], [2, 0]];
         let places = Places::new(
             &pairs,

@@ -105,7 +105,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn crop_pixels_and_the_turned_scene_agree() {
+    fn crop_pixels_agree_with_the_rotated_scene() {
         let camera = Camera::new(572.4, 540.0, 325.3, 242.0, 640, 480).unwrap();
         let point = Vec3::new(0.11, -0.07, 0.9);
         let turn = 0.7;

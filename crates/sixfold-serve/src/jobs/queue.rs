@@ -411,7 +411,7 @@ mod tests {
     }
 
     #[test]
-    fn what_ran_or_waited_when_the_server_ended_waits_again_three_times() {
+    fn interrupted_jobs_are_queued_again_three_times() {
         let dir = tempfile::tempdir().unwrap();
         let (first, second) = {
             let jobs = open(dir.path());

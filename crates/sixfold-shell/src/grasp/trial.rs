@@ -74,7 +74,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_was_asked_for_holds_in_the_hard_setting_too() {
+    fn explicit_options_hold_in_the_hard_setting_too() {
         let of = |mass, friction, hard| {
             let arguments = PhysicsArguments { gripper: "jaws-140".to_owned(), mass, friction, force: None };
             let set = hardness(&arguments, hard).unwrap();

@@ -185,7 +185,7 @@ mod tests {
     }
 
     #[test]
-    fn drawn_without_turn_it_is_what_was_cut() {
+    fn pasted_without_rotation_it_equals_the_cutout() {
         let cutout = square();
         assert_eq!(cutout.size(), (20, 30));
         let (patch, cover) = cutout.draw(60, 60, [19.5, 24.5], 30.0, 0.0);
@@ -196,7 +196,7 @@ mod tests {
     }
 
     #[test]
-    fn it_hides_about_what_it_should() {
+    fn it_hides_about_the_requested_fraction() {
         let visible = Coverage::from_fn(64, 64, |x, y| f32::from(x.abs_diff(32) < 20 && y.abs_diff(30) < 16));
         let mut off = 0.0;
         for number in 0..200 {

@@ -246,7 +246,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn errors_are_those_of_the_boxs_middle() {
+    fn errors_are_those_of_the_boxs_centre() {
         let vertices = vec![Vec3::zeros(), Vec3::x() * 0.1, Vec3::y() * 0.1, Vec3::z() * 0.1];
         let mesh = Mesh::new(vertices, vec![[0, 1, 2], [0, 2, 3]]).unwrap();
         let moved = Pose::from_translation(Vec3::new(0.003, 0.004, 0.012));

@@ -341,7 +341,7 @@ mod tests {
     }
 
     #[test]
-    fn half_of_a_box_turns_black() {
+    fn half_of_a_box_is_painted_black() {
         let image = RgbImage::from_fn(20, 20, |_, _| [200; 3]);
         let region = Rect { x: 4.0, y: 6.0, width: 8.0, height: 10.0 };
         let halves = [(4..8, 6..16), (8..12, 6..16), (4..12, 6..11), (4..12, 11..16)];
