@@ -8,7 +8,8 @@ use thiserror::Error;
 pub enum BoardError {
     /// Too little of the board is visible.
     #[error(
-        "found {found} tags of the board, expected at least {minimum}: show more of the board, sharp and well lit"
+        "found {found} tags of the board, expected at least {minimum}: show more of the board, sharp and \
+         well lit"
     )]
     TooFewTags {
         /// Tags found.
@@ -23,7 +24,8 @@ pub enum BoardError {
     Mirrored,
     /// The image is blurred.
     #[error(
-        "the photograph is blurred: edges of tags are {width:.1} pixels wide, expected at most {maximum:.1}; hold the camera still, \
+        "the photograph is blurred: edges of tags are {width:.1} pixels wide, expected at most \
+         {maximum:.1}; hold the camera still, \
          or give it more light"
     )]
     Blurred {
@@ -46,7 +48,8 @@ pub enum BoardError {
     },
     /// Too few photographs for a calibration.
     #[error(
-        "found {found} photographs that show the board, expected at least {minimum}: take more, from different sides"
+        "found {found} photographs that show the board, expected at least {minimum}: take more, from \
+         different sides"
     )]
     TooFewPhotographs {
         /// Photographs that show the board.

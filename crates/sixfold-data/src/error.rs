@@ -52,7 +52,8 @@ pub enum PosedImageError {
     },
     /// Too little of the object is visible to learn from.
     #[error(
-        "photograph {name}: its mask holds {pixels} pixels of the object, expected at least {minimum}; leave this image out or check its pose"
+        "photograph {name}: its mask holds {pixels} pixels of the object, expected at least {minimum}; \
+         leave this image out or check its pose"
     )]
     NotVisible {
         /// The image.

@@ -40,7 +40,7 @@ impl Patch {
         Patch::of_cells(&roi.cells_on_grid(scene, size, side, seen), size, side)
     }
 
-    /// Cells of a region of `size` metres, as [`Roi::look`] returns them.
+    /// Cells of a region of `size` metres, as [`Roi::cells_on_grid`] returns them.
     pub fn of_cells(cells: &[Cell], size: f64, side: usize) -> Patch {
         let mut patch = Patch::empty(side);
         for (i, [depth, x, y, z]) in cells.iter().enumerate() {

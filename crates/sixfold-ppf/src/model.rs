@@ -40,7 +40,8 @@ pub enum ModelError {
     },
     /// Too many samples: their pairs would not fit into memory.
     #[error(
-        "{found} surface samples are seen from outside, at most {maximum} are taken: raise the sampling step or check the mesh for faces that cross each other"
+        "{found} surface samples are seen from outside, at most {maximum} are taken: raise the sampling \
+         step or check the mesh for faces that cross each other"
     )]
     TooManySamples {
         /// Samples found.

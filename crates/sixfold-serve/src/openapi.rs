@@ -13,7 +13,8 @@ use crate::{access, health, jobs, objects, tasks};
 #[openapi(
     info(
         title = "Sixfold",
-        description = "6D poses of known objects, and grasps. Lengths are metres; poses are 4x4 matrices, row by row, that \
+        description = "6D poses of known objects, and grasps. Lengths are metres; poses are 4x4 matrices, \
+             row by row, that \
                        transform points of the object's (or gripper's) frame into the camera's: x right, y down, z forward. \
                        Long requests become jobs: 202 with links to events, result and overlay."
     ),

@@ -43,7 +43,8 @@ impl LeftOut {
                 format!("{found} features, expected at least {minimum}: blurred, or without texture?")
             }
             LeftOut::FewMatches { found, minimum } => format!(
-                "at most {found} features match another photograph, expected at least {minimum}: blurred, or taken too far from the others?"
+                "at most {found} features match another photograph, expected at least {minimum}: blurred, \
+                 or taken too far from the others?"
             ),
             LeftOut::OtherGroup { group } => {
                 let others: Vec<String> = group.iter().map(|i| name(*i)).collect();

@@ -40,8 +40,8 @@ pub struct PairMatches {
     pub matches: Vec<(u32, u32)>,
 }
 
-/// Mutual nearest neighbours in every pair of photographs whose descriptors' product is at least `minimum`, with the rotation of the
-/// second photograph that gives most matches; `None` when `progress` asked to stop. All descriptors have the same length, and
+/// Mutual nearest neighbours in every pair of photographs whose descriptors' product is at least `minimum`, with the rotation of
+/// the second photograph that gives most matches; `None` when `progress` asked to stop. All descriptors have the same length, and
 /// features are sorted best first.
 pub fn matched(features: &[Features], minimum: f32, progress: &dyn Progress) -> Option<Vec<PairMatches>> {
     let matrices: Vec<Vec<DMatrix<f32>>> = features.iter().map(Features::matrices).collect();

@@ -15,7 +15,8 @@ use thiserror::Error;
 pub enum TeachError {
     /// Too few photographs.
     #[error(
-        "found {found} photographs that can be used, expected at least {minimum}: take 8 to 40 from all sides, the board in sight\
+        "found {found} photographs that can be used, expected at least {minimum}: take 8 to 40 from all \
+         sides, the board in sight\
          {reasons}"
     )]
     TooFewPhotographs {
@@ -28,7 +29,8 @@ pub enum TeachError {
     },
     /// All photographs are from one side.
     #[error(
-        "all photographs are taken from within {degrees:.0} degrees: walk around the object, expected at least {minimum:.0} degrees \
+        "all photographs are taken from within {degrees:.0} degrees: walk around the object, expected at \
+         least {minimum:.0} degrees \
          between two of them"
     )]
     OneSide {
@@ -75,7 +77,8 @@ pub enum TeachError {
     NoPhotographs,
     /// Photographs without a board that cannot be registered to each other.
     #[error(
-        "{found} photographs show enough of the same, expected at least {minimum}: take 16 to 40 in steps of at most 20 degrees around \
+        "{found} photographs show enough of the same, expected at least {minimum}: take 16 to 40 in steps \
+         of at most 20 degrees around \
          the object, sharp, on a ground with much texture (newspaper, a patterned cloth) that stays in place{reasons}"
     )]
     NotTogether {

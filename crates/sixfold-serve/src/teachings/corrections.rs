@@ -87,7 +87,8 @@ fn changed(
     responses(
         (status = 200, description = "The teaching", body = TeachingView),
         (status = 404, description = "There is no such teaching or photograph", body = Problem),
-        (status = 409, description = "A job for it is running or waiting, or the camera has not been found yet", body = Problem),
+        (status = 409, description = "A job for it is running or waiting, or the camera has not been found \
+             yet", body = Problem),
         (status = 422, description = "Not a pose", body = Problem),
     ))]
 pub(crate) async fn set_pose(
@@ -205,7 +206,8 @@ fn enlarged(mask: &Mask, (width, height): (usize, usize)) -> Option<Mask> {
     responses(
         (status = 200, description = "The teaching", body = TeachingView),
         (status = 404, description = "There is no such teaching or photograph", body = Problem),
-        (status = 409, description = "A job for it is running or waiting, or the program rejected the photograph", body = Problem),
+        (status = 409, description = "A job for it is running or waiting, or the program rejected the \
+             photograph", body = Problem),
         (status = 422, description = "An invalid body", body = Problem),
     ))]
 pub(crate) async fn set_left_out(

@@ -201,7 +201,8 @@ pub(crate) struct AcceptBody {
         (status = 202, description = "The job waits for a worker", body = JobView),
         (status = 400, description = "Not a valid object name", body = Problem),
         (status = 404, description = "There is no such teaching", body = Problem),
-        (status = 409, description = "There is no mesh yet, the name is taken, or a job for it is running or waiting", body = Problem),
+        (status = 409, description = "There is no mesh yet, the name is taken, or a job for it is running \
+             or waiting", body = Problem),
         (status = 422, description = "An invalid body", body = Problem),
         (status = 429, description = "Too many waiting jobs", body = Problem),
     ))]

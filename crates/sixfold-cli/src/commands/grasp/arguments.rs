@@ -33,8 +33,8 @@ pub(crate) enum GraspCommand {
     #[command(after_help = "Examples:\n  \
         sixfold grasp learn --experiences experience.db --families all --members 6 --attempts 4 --out out/learn\n  \
         sixfold grasp learn --experiences experience.db --object drill.ply --unit mm --attempts 12 --out out/drill\n\n\
-        If the nearest experience is near enough, its grasp is tried, otherwise the geometric planner's. After a stop, \
-        the same command resumes.")]
+        If the nearest experience is near enough, its grasp is tried, otherwise the geometric \
+        planner's. After a stop, the same command resumes.")]
     Learn(Box<sixfold_shell::grasp::learn::LearnArguments>),
     /// Compare geometry, experience and both on the same simulated scenes (runs sixfold-experiments)
     #[command(disable_help_flag = true)]
