@@ -26,10 +26,10 @@ pub(crate) fn about<E: std::fmt::Display>(argument: &'static str) -> impl Fn(E) 
     move |error| PyValueError::new_err(format!("{argument}: {error}"))
 }
 
-/// A whole number of at least `least`.
-pub(crate) fn whole(argument: &str, value: i64, least: i64) -> PyResult<usize> {
-    if value < least {
-        return Err(bad(argument, format!("a whole number from {least}"), value.to_string()));
+/// A whole number of at least `minimum`.
+pub(crate) fn whole(argument: &str, value: i64, minimum: i64) -> PyResult<usize> {
+    if value < minimum {
+        return Err(bad(argument, format!("a whole number from {minimum}"), value.to_string()));
     }
     usize::try_from(value).map_err(|_| bad(argument, "a smaller number", value.to_string()))
 }

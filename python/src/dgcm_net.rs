@@ -71,9 +71,9 @@ impl DgcmNet {
         mask: &Bound<'py, PyAny>,
         seed: i64,
     ) -> PyResult<Bound<'py, PyArray1<f32>>> {
-        let look = Look::new(depth, camera, mask, seed)?;
+        let input = DepthInput::new(depth, camera, mask, seed)?;
         let model = self.0.clone();
-        let feature = interruptible(py, move |_| look.crop(&model).map(|crop| model.encode(&crop).feature))?;
+        let feature = interruptible(py, move |_| input.crop(&model).map(|crop| model.encode(&crop).feature))?;
         Ok(PyArray1::from_vec(py, feature?))
     }
 
@@ -98,24 +98,24 @@ pub(crate) fn network_of(py: Python<'_>, weights: &Bound<'_, PyAny>) -> PyResult
 }
 
 /// An object in a depth image, as it was handed in.
-pub(crate) struct Look {
+pub(crate) struct DepthInput {
     depth: DepthImage,
     camera: Camera,
     mask: Mask,
     options: ViewOptions,
 }
 
-impl Look {
+impl DepthInput {
     pub(crate) fn new(
         depth: &Bound<'_, PyAny>,
         camera: PyCamera,
         mask: &Bound<'_, PyAny>,
         seed: i64,
-    ) -> PyResult<Look> {
+    ) -> PyResult<DepthInput> {
         let depth = arrays::depth("depth", depth)?;
         let camera = camera.of_image("depth", depth.size())?;
         let options = ViewOptions { seed: arrays::seed(seed)?, ..ViewOptions::default() };
-        Ok(Look { camera, mask: arrays::mask("mask", mask)?, depth, options })
+        Ok(DepthInput { camera, mask: arrays::mask("mask", mask)?, depth, options })
     }
 
     pub(crate) fn crop(&self, model: &DgcmModel) -> PyResult<Crop> {

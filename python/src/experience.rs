@@ -17,7 +17,7 @@ use sixfold::grasp::{AntipodalQuality, Grasp};
 use crate::arrays::{self, about, bad, whole};
 use crate::bop::json_to_python;
 use crate::camera::PyCamera;
-use crate::dgcm_net::{Look, network_of};
+use crate::dgcm_net::{DepthInput, network_of};
 use crate::experienced::PyExperience;
 use crate::grasp::PyGrasp;
 use crate::gripper::gripper_of;
@@ -172,13 +172,13 @@ impl ExperienceStore {
         weights: Option<&Bound<'_, PyAny>>,
         seed: i64,
     ) -> PyResult<(i64, bool)> {
-        let look = Look::new(depth, camera, mask, seed)?;
+        let input = DepthInput::new(depth, camera, mask, seed)?;
         let grasp = grasp_of(grasp, opening, width)?;
         let gripper = gripper_of(gripper)?;
         let model = self.network(py, weights)?;
         let (provenance, time) = (provenance.to_owned(), now());
         let made = interruptible(py, move |_| {
-            let crop = look.crop(&model)?;
+            let crop = input.crop(&model)?;
             let part = part.as_deref();
             let experience =
                 Experience::new(model.as_ref(), crop, &grasp, &gripper, &object, part, time, &provenance);

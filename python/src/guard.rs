@@ -74,8 +74,8 @@ pub(crate) enum Leave {
 pub(crate) struct Tell<U>(Box<dyn Fn(U) + Send + Sync>);
 
 impl<U> Tell<U> {
-    pub(crate) fn tell(&self, news: U) {
-        (self.0)(news);
+    pub(crate) fn tell(&self, update: U) {
+        (self.0)(update);
     }
 }
 
@@ -84,13 +84,13 @@ enum Message<T, U> {
     Done(std::thread::Result<T>),
 }
 
-/// As [`interruptible`], for work that tells of its progress: `hear` gets it with the interpreter lock, and an error of it
+/// As [`interruptible`], for work that tells of its progress: `handle_update` gets it with the interpreter lock, and an error of it
 /// (what a user's callback raises) stops the work like Ctrl-C does.
 pub(crate) fn reporting<T: Send + 'static, U: Send + 'static>(
     py: Python<'_>,
     leave: Leave,
     work: impl FnOnce(&Stop, &Tell<U>) -> T + Send + 'static,
-    mut hear: impl FnMut(U) -> PyResult<()>,
+    mut handle_update: impl FnMut(U) -> PyResult<()>,
 ) -> PyResult<T> {
     let stop = Stop(Arc::new(AtomicBool::new(false)));
     let (send, mut receive) = channel::<Message<T, U>>();
@@ -99,8 +99,8 @@ pub(crate) fn reporting<T: Send + 'static, U: Send + 'static>(
         .name("sixfold".to_owned())
         .spawn(move || {
             // The receiver is gone when the call was left; then nobody wants news or result.
-            let news = send.clone();
-            let tell = Tell(Box::new(move |value| drop(news.send(Message::Progress(value)))));
+            let update = send.clone();
+            let tell = Tell(Box::new(move |value| drop(update.send(Message::Progress(value)))));
             let result = catch_unwind(AssertUnwindSafe(|| work(&flag, &tell)));
             let _ = send.send(Message::Done(result));
         })
@@ -119,7 +119,7 @@ pub(crate) fn reporting<T: Send + 'static, U: Send + 'static>(
                 };
             }
             Ok(Message::Progress(_)) if pending.is_some() => Ok(()),
-            Ok(Message::Progress(news)) => hear(news),
+            Ok(Message::Progress(update)) => handle_update(update),
             Err(RecvTimeoutError::Timeout) => Ok(()),
             Err(RecvTimeoutError::Disconnected) => {
                 return Err(PyRuntimeError::new_err(

@@ -237,7 +237,7 @@ mod tests {
     }
 
     #[test]
-    fn what_lies_against_the_lens_is_no_pose() {
+    fn an_object_at_the_lens_is_no_pose() {
         let mesh = |z: f64| {
             let vertices = vec![Vec3::new(0.0, 0.0, z), Vec3::new(0.2, 0.0, z), Vec3::new(0.0, 0.1, z)];
             Mesh::new(vertices, vec![[0, 1, 2]]).unwrap()

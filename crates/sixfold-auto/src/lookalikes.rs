@@ -217,7 +217,7 @@ mod tests {
     }
 
     #[test]
-    fn the_label_of_a_can_says_how_it_is_rotated() {
+    fn the_label_of_a_can_determines_its_rotation() {
         for degrees in [40.0f64, 100.0, 180.0, 290.0] {
             let pose = best(&can(), degrees.to_radians()).expect("another rotation agrees better");
             let off = pose.rotation_angle_to(&truth()).to_degrees();

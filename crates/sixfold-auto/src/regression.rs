@@ -192,7 +192,7 @@ mod tests {
     }
 
     #[test]
-    fn it_finds_the_probabilities_that_outcomes_were_drawn_with() {
+    fn it_recovers_the_probabilities_of_sampled_outcomes() {
         let (known, new) = (drawn(4000, 1), drawn(2000, 2));
         let model = fit(&rows(&known), &[3, 5]).scaled_to(&rows(&known));
         assert!(model.is_whole());
@@ -211,10 +211,11 @@ mod tests {
     }
 
     #[test]
-    fn what_speaks_the_wrong_way_is_left_out() {
+    fn features_with_the_wrong_sign_are_left_out() {
         // A larger number 3 makes a pose more probable; if the rows show the opposite, it is not used.
-        let turned: Vec<(Numbers, bool)> = drawn(2000, 5).into_iter().map(|(n, right)| (n, !right)).collect();
-        let model = fit(&rows(&turned), &[3, 5]);
+        let negated: Vec<(Numbers, bool)> =
+            drawn(2000, 5).into_iter().map(|(n, right)| (n, !right)).collect();
+        let model = fit(&rows(&negated), &[3, 5]);
         assert!(!model.takes.contains(&3), "{model:?}");
         assert!(model.is_whole());
     }

@@ -15,7 +15,7 @@ use sixfold_mesh::{Mesh, ModelInfo};
 use sixfold_render::{Light, Material, RenderOptions, SceneObject, VisibilityBuffer, shade};
 
 /// A method that finds what it is told, and counts how often it is asked.
-struct Told {
+struct FixedPoses {
     name: &'static str,
     needs: Needs,
     poses: Vec<Pose>,
@@ -35,7 +35,7 @@ impl PreparedObject for Nothing {
     }
 }
 
-impl PoseEstimator for Told {
+impl PoseEstimator for FixedPoses {
     fn name(&self) -> &'static str {
         self.name
     }
@@ -58,17 +58,17 @@ impl PoseEstimator for Told {
     }
 }
 
-fn told(name: &'static str, poses: &[Pose]) -> Arc<Told> {
+fn fixed_poses(name: &'static str, poses: &[Pose]) -> Arc<FixedPoses> {
     let needs = Needs { depth: Need::Required, object: Need::Required, ..Needs::default() };
-    Arc::new(Told { name, needs, poses: poses.to_vec(), asked: AtomicUsize::new(0), cannot: false })
+    Arc::new(FixedPoses { name, needs, poses: poses.to_vec(), asked: AtomicUsize::new(0), cannot: false })
 }
 
-fn by_color(name: &'static str, poses: &[Pose]) -> Arc<Told> {
+fn by_color(name: &'static str, poses: &[Pose]) -> Arc<FixedPoses> {
     let needs = Needs { rgb: Need::Required, object: Need::Required, ..Needs::default() };
-    Arc::new(Told { name, needs, poses: poses.to_vec(), asked: AtomicUsize::new(0), cannot: false })
+    Arc::new(FixedPoses { name, needs, poses: poses.to_vec(), asked: AtomicUsize::new(0), cannot: false })
 }
 
-fn asked(method: &Told) -> usize {
+fn asked(method: &FixedPoses) -> usize {
     method.asked.load(Ordering::Relaxed)
 }
 
@@ -113,7 +113,7 @@ fn images(mesh: &Mesh) -> (Arc<PreparedDepth>, RgbImage) {
 }
 
 fn found(
-    members: &[Arc<Told>],
+    members: &[Arc<FixedPoses>],
     change: impl FnOnce(&mut AutoEstimator),
     query: &Query<'_>,
     mesh: Mesh,
@@ -136,7 +136,7 @@ fn whoever_is_sure_is_the_last_to_be_asked() {
     let (depth, _) = images(&wedge());
     let camera = camera();
     let query = Query { depth: Some(&depth), ..Query::new(&camera) };
-    let (first, second) = (told("first", &[truth()]), told("second", &[beside(0.02)]));
+    let (first, second) = (fixed_poses("first", &[truth()]), fixed_poses("second", &[beside(0.02)]));
     let poses = found(&[first.clone(), second.clone()], |_| (), &query, wedge());
     assert_eq!((asked(&first), asked(&second)), (1, 0));
     assert!(poses[0].probability.unwrap() > 0.9, "{:?}", poses[0].probability);
@@ -148,7 +148,7 @@ fn whoever_is_sure_is_the_last_to_be_asked() {
     // Asked although the first is sure, and asked because it is not.
     found(&[first.clone(), second.clone()], |auto| auto.ask_all = true, &query, wedge());
     assert_eq!((asked(&first), asked(&second)), (2, 1));
-    let wrong = told("wrong", &[beside(0.3)]);
+    let wrong = fixed_poses("wrong", &[beside(0.3)]);
     let poses = found(&[wrong.clone(), first.clone()], |_| (), &query, wedge());
     assert_eq!((asked(&wrong), asked(&first)), (1, 3));
     assert_eq!(poses[0].details["method"], "first");
@@ -164,7 +164,7 @@ fn the_right_pose_wins_whoever_found_it_and_wrong_ones_are_not_reported() {
     let (depth, rgb) = images(&wedge());
     let camera = camera();
     let query = Query { depth: Some(&depth), rgb: Some(&rgb), min_confidence: 0.5, ..Query::new(&camera) };
-    let wrong = told("wrong", &[beside(0.05), beside(-0.2)]);
+    let wrong = fixed_poses("wrong", &[beside(0.05), beside(-0.2)]);
     let colour = by_color("colour", &[truth().with_translation(truth().translation() * 1.05)]);
     // Five per cent too far, as colour has it: depth brings it back.
     let poses = found(&[wrong.clone(), colour], |_| (), &query, wedge());
@@ -178,7 +178,7 @@ fn methods_that_agree_are_one_pose() {
     let (depth, _) = images(&wedge());
     let camera = camera();
     let query = Query { depth: Some(&depth), max_instances: 3, ..Query::new(&camera) };
-    let members = [told("a", &[truth()]), told("b", &[beside(0.001), beside(0.3)])];
+    let members = [fixed_poses("a", &[truth()]), fixed_poses("b", &[beside(0.001), beside(0.3)])];
     let poses = found(&members, |auto| auto.ask_all = true, &query, wedge());
     assert_eq!(poses[0].details["found_by"], serde_json::json!(["a", "b"]));
     assert!(poses[1..].iter().all(|p| p.probability < poses[0].probability));
@@ -191,8 +191,8 @@ fn two_poses_that_look_alike_are_both_said() {
     let camera = camera();
     let query = Query { depth: Some(&depth), ..Query::new(&camera) };
     let half = Pose::exp(&Vector6::new(0.0, 0.0, 0.0, 0.0, 0.0, std::f64::consts::PI));
-    let turned = Pose::new(truth().rotation() * half.rotation(), truth().translation());
-    let poses = found(&[told("a", &[truth(), turned])], |_| (), &query, solid(1.0));
+    let rotated = Pose::new(truth().rotation() * half.rotation(), truth().translation());
+    let poses = found(&[fixed_poses("a", &[truth(), rotated])], |_| (), &query, solid(1.0));
     let alternatives = poses[0].details["alternatives"].as_array().unwrap();
     assert_eq!(alternatives.len(), 1, "{alternatives:?}");
     let weight = alternatives[0]["weight"].as_f64().unwrap();
@@ -200,13 +200,15 @@ fn two_poses_that_look_alike_are_both_said() {
 }
 
 #[test]
-fn who_cannot_answer_is_left_out_and_said() {
+fn members_that_cannot_run_are_left_out_and_reported() {
     let (depth, _) = images(&wedge());
     let camera = camera();
     let query = Query { depth: Some(&depth), ..Query::new(&camera) };
-    let lacking = Arc::new(Told { cannot: true, ..Arc::into_inner(told("untrained", &[])).unwrap() });
+    let lacking =
+        Arc::new(FixedPoses { cannot: true, ..Arc::into_inner(fixed_poses("untrained", &[])).unwrap() });
     let colour = by_color("colour", &[truth()]);
-    let poses = found(&[lacking.clone(), colour.clone(), told("a", &[truth()])], |_| (), &query, wedge());
+    let poses =
+        found(&[lacking.clone(), colour.clone(), fixed_poses("a", &[truth()])], |_| (), &query, wedge());
     assert_eq!((asked(&lacking), asked(&colour)), (0, 0));
     assert!(
         poses[0].notes[0].contains("--method untrained was not asked: object wedge: has no weights"),
@@ -222,9 +224,9 @@ fn who_cannot_answer_is_left_out_and_said() {
     assert!(error.contains("--method auto") && error.contains("--rgb"), "{error}");
     // Without a mesh nothing can be judged: a method that knows the object answers alone, and if none does, a mesh is lacking.
     let bare = Object { mesh: None, ..Object::of_model(None) };
-    let nobody = AutoEstimator::new(vec![lacking as Arc<dyn PoseEstimator>]).unwrap();
-    assert!(matches!(nobody.prepare(&bare), Err(EstimatorError::Lacks { method: "auto", .. })));
-    let one = AutoEstimator::new(vec![told("a", &[truth()]) as Arc<dyn PoseEstimator>]).unwrap();
+    let none_able = AutoEstimator::new(vec![lacking as Arc<dyn PoseEstimator>]).unwrap();
+    assert!(matches!(none_able.prepare(&bare), Err(EstimatorError::Lacks { method: "auto", .. })));
+    let one = AutoEstimator::new(vec![fixed_poses("a", &[truth()]) as Arc<dyn PoseEstimator>]).unwrap();
     let poses = one.estimate(one.prepare(&bare).unwrap().as_ref(), &query).unwrap();
     assert_eq!(poses.len(), 1);
     assert_eq!((poses[0].probability, &poses[0].details["method"]), (None, &"a".into()));

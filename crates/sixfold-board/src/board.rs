@@ -157,8 +157,8 @@ impl Board {
     fn place(&self, id: usize) -> Option<(f64, f64)> {
         let (columns, rows, first) = self.paper.tags();
         let number = id.checked_sub(first).filter(|n| *n < columns * rows)?;
-        let from_middle = |i: usize, n: usize| i as f64 * (TAG + GAP) - 0.5 * (n as f64 * (TAG + GAP) - GAP);
-        Some((from_middle(number % columns, columns), -from_middle(number / columns, rows)))
+        let from_centre = |i: usize, n: usize| i as f64 * (TAG + GAP) - 0.5 * (n as f64 * (TAG + GAP) - GAP);
+        Some((from_centre(number % columns, columns), -from_centre(number / columns, rows)))
     }
 
     /// The corners of a tag in the board's frame, metres: top left, top right, bottom right, bottom left; `None` for a tag that is
@@ -193,7 +193,7 @@ impl Board {
     pub fn is_white(&self, x: f64, y: f64) -> Option<bool> {
         let (x, y) = (x / self.scale, y / self.scale);
         let (width, height) = self.paper.size();
-        let below = self.middle_below_sheets();
+        let below = self.tags_above_sheet_centre();
         if x.abs() > 0.5 * width || (y + below).abs() > 0.5 * height {
             return None;
         }
@@ -217,13 +217,13 @@ impl Board {
     /// The extent of the sheet in the board's frame: smallest and largest coordinates, metres.
     pub fn extent(&self) -> [Vec2; 2] {
         let (width, height) = self.paper.size();
-        let centre = Vec2::new(0.0, -self.middle_below_sheets());
+        let centre = Vec2::new(0.0, -self.tags_above_sheet_centre());
         let half = Vec2::new(0.5 * width, 0.5 * height);
         [(centre - half) * self.scale, (centre + half) * self.scale]
     }
 
     /// How far the centre of the tags is above the centre of the sheet, metres: the ruler is below the tags.
-    pub(crate) fn middle_below_sheets(&self) -> f64 {
+    pub(crate) fn tags_above_sheet_centre(&self) -> f64 {
         0.008
     }
 
@@ -231,12 +231,12 @@ impl Board {
     pub(crate) fn print(&self) -> Print {
         let (width, height) = self.paper.size();
         let (columns, rows, first) = self.paper.tags();
-        let (middle_x, middle_y) = (0.5 * width, 0.5 * height - self.middle_below_sheets());
+        let (centre_x, centre_y) = (0.5 * width, 0.5 * height - self.tags_above_sheet_centre());
         let cell = TAG / SIDE as f64;
         let mut black = vec![];
         for id in first..first + columns * rows {
             let Some((x, y)) = self.place(id) else { continue };
-            let (left, top) = (middle_x + x, middle_y - y);
+            let (left, top) = (centre_x + x, centre_y - y);
             let edge = TAG - cell;
             black.extend([
                 [left, top, TAG, cell],
@@ -257,7 +257,7 @@ impl Board {
                 }
             }
         }
-        let (ruler_x, ruler_y) = (middle_x - 0.5 * RULER, height - 0.012);
+        let (ruler_x, ruler_y) = (centre_x - 0.5 * RULER, height - 0.012);
         black.push([ruler_x, ruler_y, RULER, 0.0003]);
         for millimetre in 0..=100 {
             let long = match millimetre {
@@ -311,7 +311,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn tags_and_ruler_are_on_the_sheet_and_apart() {
+    fn tags_and_ruler_are_on_the_sheet_without_overlap() {
         for paper in Paper::ALL {
             let board = Board::new(paper);
             let (width, height) = paper.size();
@@ -323,7 +323,7 @@ mod tests {
                     "{paper}"
                 );
             }
-            let lowest = 0.5 * height - board.middle_below_sheets();
+            let lowest = 0.5 * height - board.tags_above_sheet_centre();
             let first = paper.tags().2;
             let last = board.tag_corners(first + board.len() - 1).unwrap();
             assert!(
@@ -343,7 +343,7 @@ mod tests {
             for x in (0..420).step_by(5) {
                 // Centre of the pixel in the board's frame.
                 let u = (x as f64 + 0.5) / 2000.0 - 0.5 * width;
-                let v = 0.5 * height - board.middle_below_sheets() - (y as f64 + 0.5) / 2000.0;
+                let v = 0.5 * height - board.tags_above_sheet_centre() - (y as f64 + 0.5) / 2000.0;
                 assert_eq!(board.is_white(u, v), Some(image[(x, y)] == [255; 3]), "{x} {y}");
             }
         }

@@ -70,15 +70,15 @@ pub fn calibrate(
     for _ in 0..3 {
         let used: Vec<usize> = (0..states.len()).filter(|i| states[*i].is_ok()).collect();
         if used.len() < FEWEST {
-            return Err(BoardError::TooFewPhotographs { found: used.len(), least: FEWEST });
+            return Err(BoardError::TooFewPhotographs { found: used.len(), minimum: FEWEST });
         }
         let views: Vec<Vec<Corner>> = used.iter().map(|i| photographs[*i].clone()).collect();
         let found = of_views(&views, size, options)?;
         let mut all_fit = true;
         for ((i, residuals), corners) in used.iter().zip(&found.residuals).zip(&views) {
-            let (rms, most) = (root_mean_square(residuals), allowed_misfit(corners));
-            if rms > most {
-                states[*i] = Err(BoardError::DoesNotFit { found: rms, most });
+            let (rms, maximum) = (root_mean_square(residuals), allowed_misfit(corners));
+            if rms > maximum {
+                states[*i] = Err(BoardError::DoesNotFit { found: rms, maximum });
                 all_fit = false;
             }
         }
@@ -150,10 +150,10 @@ fn of_views(
 /// The focal length for which the board's axes are perpendicular and of equal length in every photograph, with the principal point
 /// at the centre (Zhang 2000, section 3.1); `None` if all views are frontal.
 fn initial_focal(views: &[Vec<Corner>], width: usize, height: usize) -> Option<f64> {
-    let middle = Vec2::new(0.5 * (width as f64 - 1.0), 0.5 * (height as f64 - 1.0));
+    let centre = Vec2::new(0.5 * (width as f64 - 1.0), 0.5 * (height as f64 - 1.0));
     let (mut numerator, mut denominator) = (0.0, 0.0);
     for view in views {
-        let pairs: Vec<_> = view.iter().map(|c| (c.on_board.xy(), c.pixel - middle)).collect();
+        let pairs: Vec<_> = view.iter().map(|c| (c.on_board.xy(), c.pixel - centre)).collect();
         let Some(h) = homography(&pairs) else { continue };
         // In units of the image's size, for numbers of similar magnitude.
         let s = 1.0 / width.max(height) as f64;

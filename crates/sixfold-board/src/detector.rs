@@ -133,7 +133,7 @@ fn level(grey: &Image<u8>, image_from_tag: &Mat3, column: i32, row: i32) -> Opti
 /// Brightness that changes linearly over a tag, for light from one side.
 struct Gradient {
     mean: f64,
-    middle: (f64, f64),
+    centre: (f64, f64),
     slope: (f64, f64),
 }
 
@@ -153,11 +153,11 @@ impl Gradient {
         }
         let det = uu * vv - uv * uv;
         let slope = ((ul * vv - vl * uv) / det, (vl * uu - ul * uv) / det);
-        (det > 0.0).then_some(Gradient { mean, middle: (mu, mv), slope })
+        (det > 0.0).then_some(Gradient { mean, centre: (mu, mv), slope })
     }
 
     fn at(&self, u: f64, v: f64) -> f64 {
-        self.mean + self.slope.0 * (u - self.middle.0) + self.slope.1 * (v - self.middle.1)
+        self.mean + self.slope.0 * (u - self.centre.0) + self.slope.1 * (v - self.centre.1)
     }
 }
 
@@ -186,8 +186,8 @@ fn dark_pixels(grey: &Image<u8>) -> Image<bool> {
     });
     Image::from_fn(width, height, |x, y| {
         let (low, high) = around[(x / tile, y / tile)];
-        let middle = low + (high - low) / 2;
-        high - low >= CONTRAST && grey[(x, y)] < middle
+        let mid_grey = low + (high - low) / 2;
+        high - low >= CONTRAST && grey[(x, y)] < mid_grey
     })
 }
 

@@ -8,13 +8,14 @@ use thiserror::Error;
 pub enum BoardError {
     /// Too little of the board is visible.
     #[error(
-        "found {found} tags of the board, expected at least {least}: show more of the board, sharp and well lit"
+        "found {found} tags of the board, expected at least {minimum}: show more of the board, sharp and \
+         well lit"
     )]
     TooFewTags {
         /// Tags found.
         found: usize,
         /// Tags needed.
-        least: usize,
+        minimum: usize,
     },
     /// The image is mirrored.
     #[error(
@@ -23,35 +24,38 @@ pub enum BoardError {
     Mirrored,
     /// The image is blurred.
     #[error(
-        "the photograph is blurred: edges of tags are {width:.1} pixels wide, expected at most {most:.1}; hold the camera still, \
+        "the photograph is blurred: edges of tags are {width:.1} pixels wide, expected at most \
+         {maximum:.1}; hold the camera still, \
          or give it more light"
     )]
     Blurred {
         /// Width of the edges, pixels.
         width: f64,
         /// What is allowed for tags of this size.
-        most: f64,
+        maximum: f64,
     },
     /// The corners fit no pose of the board.
     #[error(
-        "corners are {found:.1} pixels from where the board would have them, expected at most {most:.1}: is the board flat, and \
+        "corners deviate by {found:.1} pixels from the board's layout, expected at most {maximum:.1}: is the \
+         board flat, and \
          the camera file that of this photograph?"
     )]
     DoesNotFit {
         /// Root mean square distance, pixels.
         found: f64,
         /// What is allowed.
-        most: f64,
+        maximum: f64,
     },
     /// Too few photographs for a calibration.
     #[error(
-        "found {found} photographs that show the board, expected at least {least}: take more, from different sides"
+        "found {found} photographs that show the board, expected at least {minimum}: take more, from \
+         different sides"
     )]
     TooFewPhotographs {
         /// Photographs that show the board.
         found: usize,
         /// Photographs needed.
-        least: usize,
+        minimum: usize,
     },
     /// The photographs do not determine the camera.
     #[error(

@@ -39,7 +39,7 @@ pub(crate) fn decode(read: &Cells) -> Option<(usize, usize)> {
         let code = code_of(&cells);
         for (id, other) in codes().iter().enumerate() {
             let wrong = (code ^ other).count_ones();
-            if wrong <= REPAIRED && best.is_none_or(|(least, ..)| wrong < least) {
+            if wrong <= REPAIRED && best.is_none_or(|(minimum, ..)| wrong < minimum) {
                 best = Some((wrong, id, rotation));
             }
         }

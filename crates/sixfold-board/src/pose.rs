@@ -51,9 +51,9 @@ pub fn board_pose(corners: &[Corner], camera: &Camera) -> Result<BoardPose, Boar
         })
         .min_by(|a, b| a.rms.total_cmp(&b.rms))
         .ok_or(BoardError::NoSolution)?;
-    let most = allowed_misfit(corners);
-    if found.rms > most {
-        return Err(BoardError::DoesNotFit { found: found.rms, most });
+    let maximum = allowed_misfit(corners);
+    if found.rms > maximum {
+        return Err(BoardError::DoesNotFit { found: found.rms, maximum });
     }
     Ok(found)
 }
@@ -61,12 +61,12 @@ pub fn board_pose(corners: &[Corner], camera: &Camera) -> Result<BoardPose, Boar
 /// An error if corners are too few or too blurred.
 pub(crate) fn check_corners(corners: &[Corner]) -> Result<(), BoardError> {
     if corners.len() < 4 * FEWEST_TAGS {
-        return Err(BoardError::TooFewTags { found: corners.len() / 4, least: FEWEST_TAGS });
+        return Err(BoardError::TooFewTags { found: corners.len() / 4, minimum: FEWEST_TAGS });
     }
     let width = median(corners.iter().map(|c| c.edge_width));
-    let most = (WIDEST_EDGE * median(corners.iter().map(|c| c.side))).max(SHARP);
-    if width > most {
-        return Err(BoardError::Blurred { width, most });
+    let maximum = (WIDEST_EDGE * median(corners.iter().map(|c| c.side))).max(SHARP);
+    if width > maximum {
+        return Err(BoardError::Blurred { width, maximum });
     }
     Ok(())
 }

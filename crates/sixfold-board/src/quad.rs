@@ -68,7 +68,7 @@ pub(crate) fn around(hull: &[Vec2]) -> Option<Quad> {
                 continue;
             }
             let added = 0.5 * cross(meet - b, c - b).abs();
-            if best.is_none_or(|(least, ..)| added < least) {
+            if best.is_none_or(|(minimum, ..)| added < minimum) {
                 best = Some((added, i, meet));
             }
         }
@@ -133,12 +133,12 @@ fn edge(image: &Image<u8>, from: Vec2, to: Vec2, outside: Vec2, reach: f64) -> O
     Some((point, along, slopes[slopes.len() / 2]))
 }
 
-/// The line fitted to at least `least` points; outliers are left out.
-fn fitted_line(points: &[Vec2], least: usize) -> Option<(Vec2, Vec2)> {
+/// The line fitted to at least `minimum` points; outliers are left out.
+fn fitted_line(points: &[Vec2], minimum: usize) -> Option<(Vec2, Vec2)> {
     let mut kept: Vec<Vec2> = points.to_vec();
     let mut line = None;
     for _ in 0..3 {
-        if kept.len() < least.max(4) {
+        if kept.len() < minimum.max(4) {
             return None;
         }
         let mean = kept.iter().sum::<Vec2>() / kept.len() as f64;
@@ -154,9 +154,9 @@ fn fitted_line(points: &[Vec2], least: usize) -> Option<(Vec2, Vec2)> {
         let off = |p: &Vec2| cross(along, p - mean).abs();
         let mut offs: Vec<f64> = kept.iter().map(off).collect();
         offs.sort_by(f64::total_cmp);
-        let most = 3.0 * offs[offs.len() / 2] + 0.05;
+        let maximum = 3.0 * offs[offs.len() / 2] + 0.05;
         line = Some((mean, along));
-        kept.retain(|p| off(p) <= most);
+        kept.retain(|p| off(p) <= maximum);
     }
     line
 }

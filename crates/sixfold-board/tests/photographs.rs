@@ -95,15 +95,15 @@ fn a_camera_is_calibrated_and_poses_are_exact() {
     }
     assert!(found.rms < 0.2, "{}", found.rms);
     let mut away = vec![];
-    let mut turned = vec![];
+    let mut angles = vec![];
     for (view, truth) in found.views.iter().zip(poses()) {
         let pose = view.as_ref().unwrap().camera_from_board;
         away.push(pose.distance_to(&truth));
-        turned.push(pose.rotation_angle_to(&truth).to_degrees());
+        angles.push(pose.rotation_angle_to(&truth).to_degrees());
     }
     away.sort_by(f64::total_cmp);
-    turned.sort_by(f64::total_cmp);
-    assert!(away[5] < 0.001 && turned[5] < 0.1, "{away:?} {turned:?}");
+    angles.sort_by(f64::total_cmp);
+    assert!(away[5] < 0.001 && angles[5] < 0.1, "{away:?} {angles:?}");
     // With the true camera.
     for (corners, truth) in photographs.iter().zip(poses()) {
         let pose = board_pose(corners, &camera()).unwrap().camera_from_board;
@@ -112,7 +112,7 @@ fn a_camera_is_calibrated_and_poses_are_exact() {
 }
 
 #[test]
-fn what_cannot_be_used_is_refused_with_the_reason() {
+fn unusable_photographs_are_refused_with_the_reason() {
     let board = Board::new(Paper::A4);
     let truth = pose(0.4, 0.3, 0.45);
     let good = photograph(&board, &camera(), &truth, &Conditions::default(), 3);
@@ -122,7 +122,7 @@ fn what_cannot_be_used_is_refused_with_the_reason() {
     let blank = detect_tags(&Image::filled(64, 48, [200; 3]));
     assert!(blank.tags.is_empty() && blank.mirrored == 0);
     let few = &corners(&good)[..8];
-    assert_eq!(board_pose(few, &camera()), Err(BoardError::TooFewTags { found: 2, least: 4 }));
+    assert_eq!(board_pose(few, &camera()), Err(BoardError::TooFewTags { found: 2, minimum: 4 }));
     // The camera of another image.
     let other = Camera { fx: 2000.0, ..camera() };
     assert!(matches!(board_pose(&corners(&good), &other), Err(BoardError::DoesNotFit { .. })));
@@ -154,7 +154,7 @@ fn what_cannot_be_used_is_refused_with_the_reason() {
     let refused = calibrate(&frontal, (960, 720), &CalibrationOptions::default());
     assert!(matches!(refused, Err(BoardError::Undetermined { .. } | BoardError::NoSolution)), "{refused:?}");
     let refused = calibrate(&frontal[..2], (960, 720), &CalibrationOptions::default());
-    assert_eq!(refused, Err(BoardError::TooFewPhotographs { found: 2, least: 4 }));
+    assert_eq!(refused, Err(BoardError::TooFewPhotographs { found: 2, minimum: 4 }));
 }
 
 #[test]

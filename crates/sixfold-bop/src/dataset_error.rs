@@ -38,7 +38,7 @@ pub enum DatasetError {
         path: PathBuf,
         /// Its description.
         what: &'static str,
-        /// What to do.
+        /// Advice.
         advice: &'static str,
     },
     /// The system could not read a file or folder.

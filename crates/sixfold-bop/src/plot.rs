@@ -163,7 +163,7 @@ mod tests {
     }
 
     #[test]
-    fn the_thick_line_is_where_the_recall_is() {
+    fn the_thick_line_is_at_the_recall() {
         for recall in [0.25, 0.75] {
             let picture = draw_recall_curves(&evaluation(recall));
             // The curve is level in the right half of the first panel: scan the column at three quarters of its
@@ -171,17 +171,17 @@ mod tests {
             let x = LEFT + (PANEL_WIDTH - LEFT - RIGHT) * 3 / 4 + 7;
             let dark: Vec<usize> =
                 (TOP..PANEL_HEIGHT - BOTTOM - 4).filter(|&y| picture[(x, y)] == INK).collect();
-            let middle = dark.iter().sum::<usize>() as f64 / dark.len() as f64;
+            let centre = dark.iter().sum::<usize>() as f64 / dark.len() as f64;
             let expected = TOP as f64 + (PANEL_HEIGHT - TOP - BOTTOM) as f64 * (1.0 - recall);
             assert!(
-                (middle - expected).abs() < 2.0,
-                "recall {recall}: line at {middle}, expected {expected}"
+                (centre - expected).abs() < 2.0,
+                "recall {recall}: line at {centre}, expected {expected}"
             );
         }
     }
 
     #[test]
-    fn a_picture_is_written() {
+    fn a_plot_is_written() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("curves.png");
         write_recall_curves(&path, &evaluation(0.5)).unwrap();

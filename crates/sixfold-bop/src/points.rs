@@ -58,12 +58,12 @@ impl ModelPoints {
             }
             let extent = |axis: usize| nodes[index].high[axis] - nodes[index].low[axis];
             let axis = (0..3).fold(0, |best, a| if extent(a) > extent(best) { a } else { best });
-            let middle = (end - start) / 2;
-            sorted[start..end].select_nth_unstable_by(middle, |a, b| a[axis].total_cmp(&b[axis]));
+            let half = (end - start) / 2;
+            sorted[start..end].select_nth_unstable_by(half, |a, b| a[axis].total_cmp(&b[axis]));
             let children = nodes.len();
             nodes[index].children = children;
-            nodes.push(bounds(&sorted, start, start + middle));
-            nodes.push(bounds(&sorted, start + middle, end));
+            nodes.push(bounds(&sorted, start, start + half));
+            nodes.push(bounds(&sorted, start + half, end));
             todo.extend([children, children + 1]);
         }
         Some(ModelPoints {
@@ -255,7 +255,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn the_tree_finds_what_brute_force_finds(points in points(), by in pose()) {
+        fn the_tree_agrees_with_brute_force(points in points(), by in pose()) {
             let model = ModelPoints::new(&points).unwrap();
             let brute: f64 = points.iter().map(|p| {
                 let q = by.transform_point(p);

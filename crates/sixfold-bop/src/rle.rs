@@ -22,7 +22,7 @@ pub enum RleError {
         height: u64,
     },
     /// The runs do not fill the mask.
-    #[error("the runs add up to {found} pixels, the size says {expected}")]
+    #[error("the runs add up to {found} pixels, the size gives {expected}")]
     Sum {
         /// Width times height.
         expected: u64,

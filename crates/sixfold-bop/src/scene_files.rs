@@ -40,7 +40,7 @@ pub struct GroundTruth {
     pub obj_id: u32,
     /// Its pose.
     pub camera_from_object: Pose,
-    /// The rotation as written in the file, if it came from one (LM-O's differ from a rotation by up to a thousandth); the
+    /// The rotation as written in the file, if it came from one (in LM-O `R^T R` deviates from the identity by up to 0.009); the
     /// pose holds the nearest true rotation. An evaluation computes errors with these numbers, as the official one does.
     pub rotation_as_written: Option<Mat3>,
 }

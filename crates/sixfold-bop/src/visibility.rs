@@ -201,7 +201,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_behind_the_camera_has_no_box() {
+    fn points_behind_the_camera_have_no_box() {
         let mesh = square();
         let found = &ground_truth_visibility(&[(&mesh, at(0.0, -1.0))], &camera(), None, VISIBILITY_DELTA)[0];
         assert_eq!((found.info.bbox_obj, found.info.visib_fract), (None, 0.0));

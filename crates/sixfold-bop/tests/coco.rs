@@ -31,7 +31,7 @@ fn assert_close(case: &str, found: &CocoScores, expected: &serde_json::Value) {
 }
 
 #[test]
-fn frozen_cases_score_as_pycocotools_says() {
+fn frozen_cases_score_as_with_pycocotools() {
     for case in ["coco_a", "coco_b"] {
         let (truth, detections) = load(case);
         let expected = std::fs::read_to_string(fixture(&format!("{case}_expected.json"))).unwrap();

@@ -13,7 +13,7 @@ use sixfold_geometry::nalgebra::{Quaternion, UnitQuaternion};
 use sixfold_geometry::{Pose, Vec3};
 
 #[test]
-fn lmo_published_results_score_as_the_official_toolkit_says() {
+fn lmo_published_results_score_as_with_the_official_toolkit() {
     let Some(dir) = support::data("lmo") else { return };
     let dataset = BopDataset::open(&dir, "test").unwrap();
     let estimates = read_results(&dir.join("published/cnos-fastsam-megapose_lmo-test.csv")).unwrap();
@@ -129,7 +129,7 @@ fn the_scores_do_not_depend_on_the_number_of_threads() {
 }
 
 #[test]
-fn hope_as_a_bare_scene_folder_has_no_depth_and_says_so() {
+fn hope_as_a_bare_scene_folder_reports_missing_depth() {
     let Some(dir) = support::data("hope") else { return };
     let dataset = BopDataset::open(&dir, "test").unwrap();
     let targets = dataset.targets(None).unwrap();

@@ -156,7 +156,7 @@ fn what_was_written_is_read_back() {
 }
 
 #[test]
-fn ground_truth_scores_one_with_vsd_and_a_symmetric_half_turn_too() {
+fn ground_truth_and_its_symmetric_pose_score_one_with_vsd() {
     let (_dir, dataset) = written();
     let mut estimates = truth_as_estimates(&dataset);
     let found = score(&dataset, &estimates);
@@ -322,7 +322,7 @@ fn options_out_of_range_are_refused() {
 }
 
 #[test]
-fn a_writer_refuses_what_does_not_fit() {
+fn a_writer_refuses_invalid_data() {
     let dir = tempfile::tempdir().unwrap();
     let camera = camera();
     let mut writer = SceneWriter::new(dir.path(), "test", 1);

@@ -89,7 +89,7 @@ const METAS: [&str; 5] = [
 ];
 
 #[test]
-fn ho3d_says_the_same_in_every_protocol_of_pickle() {
+fn ho3d_reads_the_same_from_every_protocol_of_pickle() {
     let all = [&METAS[..], &["meta_without_pose.pkl"]].concat();
     let dir = ho3d(&all, |bytes| bytes);
     let out = dir.path().join("out");
@@ -136,7 +136,7 @@ fn ho3d_takes_every_nth_image_of_chosen_sequences() {
 }
 
 #[test]
-fn what_is_wrong_with_a_meta_file_is_named() {
+fn errors_of_a_meta_file_are_named() {
     let convert = |edit: &dyn Fn(Vec<u8>) -> Vec<u8>| {
         let dir = ho3d(&["meta_python3_protocol4.pkl"], edit);
         import_ho3d(dir.path(), &dir.path().join("out"), &ho3d_options(dir.path()), &())
@@ -267,7 +267,7 @@ fn smot_is_in_metres_there_and_in_millimetres_here() {
 }
 
 #[test]
-fn what_is_wrong_with_smot_is_named() {
+fn errors_of_smot_are_named() {
     let options = SmotOptions { split: "train".into(), every: 1 };
     let convert = |from: &str, to: &str| {
         let dir = smot(&SMOT_TRUTH.replace(from, to));

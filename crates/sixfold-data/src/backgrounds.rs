@@ -48,13 +48,17 @@ pub fn backgrounds_with_images(
             posed.camera().project(&posed.camera_from_object().transform_point(&corner))
         });
         let (x, y): (Vec<f64>, Vec<f64>) = corners.map(|c| (c.x, c.y)).unzip();
-        let least = |v: &[f64]| v.iter().copied().fold(f64::INFINITY, f64::min);
+        let minimum = |v: &[f64]| v.iter().copied().fold(f64::INFINITY, f64::min);
         let most = |v: &[f64]| v.iter().copied().fold(f64::NEG_INFINITY, f64::max);
         if x.is_empty() {
             continue;
         }
-        let rect =
-            Rect { x: least(&x), y: least(&y), width: most(&x) - least(&x), height: most(&y) - least(&y) };
+        let rect = Rect {
+            x: minimum(&x),
+            y: minimum(&y),
+            width: most(&x) - minimum(&x),
+            height: most(&y) - minimum(&y),
+        };
         match frames.iter_mut().find(|(image, _)| Arc::ptr_eq(image, posed.image())) {
             Some((_, rects)) => rects.push(rect),
             None => frames.push((posed.image(), vec![rect])),

@@ -160,7 +160,7 @@ mod tests {
     }
 
     #[test]
-    fn every_change_of_what_is_learnt_from_is_seen() {
+    fn every_change_of_the_training_data_is_detected() {
         assert!(changed(|s| s.description.clear()).is_empty());
         assert_eq!(changed(|s| s.objects.reverse()), ["ids"]);
         assert_eq!(changed(|s| s.frames.push(FrameId::new(2, 37))), ["frames"]);

@@ -23,7 +23,8 @@ pub enum PosedImageError {
     },
     /// Image, mask and camera are not of one size.
     #[error(
-        "photograph {name}: the {what} is {width}x{height}, the camera says {camera_width}x{camera_height}; give the camera of this image"
+        "photograph {name}: the {what} is {width}x{height}, the camera is for \
+         {camera_width}x{camera_height}; give the camera of this image"
     )]
     Size {
         /// The image.
@@ -51,7 +52,8 @@ pub enum PosedImageError {
     },
     /// Too little of the object is visible to learn from.
     #[error(
-        "photograph {name}: its mask holds {pixels} pixels of the object, expected at least {least}; leave this image out or check its pose"
+        "photograph {name}: its mask holds {pixels} pixels of the object, expected at least {minimum}; \
+         leave this image out or check its pose"
     )]
     NotVisible {
         /// The image.
@@ -59,10 +61,10 @@ pub enum PosedImageError {
         /// Visible pixels.
         pixels: usize,
         /// The minimum number.
-        least: usize,
+        minimum: usize,
     },
     /// It is unknown where the object is visible.
-    #[error("photograph {name}: no mask says where the object is visible; give its mask")]
+    #[error("photograph {name}: no mask of the visible part of the object; give one")]
     NoMask {
         /// The image.
         name: String,

@@ -125,7 +125,7 @@ impl PosedImage {
         let Some(mask) = &self.mask else { return Err(PosedImageError::NoMask { name: name() }) };
         let pixels = mask.pixels();
         if pixels < MIN_PIXELS {
-            return Err(PosedImageError::NotVisible { name: name(), pixels, least: MIN_PIXELS });
+            return Err(PosedImageError::NotVisible { name: name(), pixels, minimum: MIN_PIXELS });
         }
         Ok(())
     }
@@ -222,7 +222,7 @@ mod tests {
         assert!(text.contains("0 pixels") && text.contains("at least 64"), "{text}");
         assert!(empty.cutout().is_none());
         let text = with(&Mask::filled(3, 3, true)).unwrap_err().to_string();
-        assert!(text.contains("first.png: the mask is 3x3, the camera says 320x240"), "{text}");
+        assert!(text.contains("first.png: the mask is 3x3, the camera is for 320x240"), "{text}");
         // Behind the camera, far outside the image, not a number; slightly outside is no error.
         for place in [[0.0, 0.0, -0.6], [9.0, 0.0, 0.6], [0.0, f64::NAN, 0.6]] {
             let text = make(Pose::from_translation(place.into())).unwrap_err().to_string();

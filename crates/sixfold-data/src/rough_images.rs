@@ -329,7 +329,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_mask_that_lies_where_the_pose_says_is_taken() {
+    fn the_mask_that_overlaps_the_expected_one_is_used() {
         let bar = |from: usize, to: usize| Mask::from_fn(20, 4, |x, _| (from..to).contains(&x));
         let seen = |category_id: u32, mask: &Mask| Detection {
             scene_id: 0,

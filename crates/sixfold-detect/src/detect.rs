@@ -1,13 +1,13 @@
 //! From an image to boxes: resizing and padding, decoding, non-maximum suppression, masks.
 
-use crate::loss::{distance, middle};
+use crate::loss::{cell_centre, distance};
 use crate::network::{DetectorConfig, FINEST_STRIDE, MASK_STRIDE};
 use sixfold_geometry::stats::sigmoid;
 use sixfold_geometry::{Mask, Rect, RgbImage};
 use sixfold_synth::augment::{AffineMap, Patch};
 
 /// Upper bound of the number of detections per image, of one object or of all.
-const MOST_DETECTIONS: usize = 10_000;
+const MAX_DETECTIONS: usize = 10_000;
 
 /// Which detections are returned.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -48,9 +48,9 @@ impl DetectOptions {
             }
         }
         for (field, value) in [("per_class (--per-object)", self.per_class), ("most", self.most)] {
-            if !(1..=MOST_DETECTIONS).contains(&value) {
+            if !(1..=MAX_DETECTIONS).contains(&value) {
                 return Err(format!(
-                    "detection option {field}: found {value}, expected 1 to {MOST_DETECTIONS}"
+                    "detection option {field}: found {value}, expected 1 to {MAX_DETECTIONS}"
                 ));
             }
         }
@@ -189,7 +189,7 @@ pub fn decode(
     /// Maximum number of candidates in the suppression.
     const MAX_CANDIDATES: usize = 2000;
     let threshold = options.threshold.clamp(1e-4, 1.0 - 1e-6);
-    let least_logit = (threshold / (1.0 - threshold)).ln();
+    let min_logit = (threshold / (1.0 - threshold)).ln();
     let limits = image.filled.map(|side| side as f32 - 0.5);
     let mut candidates = vec![];
     for level in 0..config.levels {
@@ -197,11 +197,11 @@ pub fn decode(
         let width = image.width / stride;
         let locations = width * (image.height / stride);
         for (index, logit) in raw.scores[level].iter().enumerate() {
-            if *logit < least_logit {
+            if *logit < min_logit {
                 continue;
             }
             let (class, location) = (index / locations, index % locations);
-            let [x, y] = middle(location, width, stride as f32);
+            let [x, y] = cell_centre(location, width, stride as f32);
             let far: [f32; 4] =
                 std::array::from_fn(|i| distance(raw.boxes[level][i * locations + location], stride as f32));
             let corners = [

@@ -70,7 +70,7 @@ pub(crate) fn distance(raw: f32, stride: f32) -> f32 {
 }
 
 /// Centre of a location in pixels; pixel centres are at whole numbers.
-pub(crate) fn middle(location: usize, width: usize, stride: f32) -> [f32; 2] {
+pub(crate) fn cell_centre(location: usize, width: usize, stride: f32) -> [f32; 2] {
     [location % width, location / width].map(|at| (at as f32 + 0.5) * stride - 0.5)
 }
 
@@ -136,7 +136,7 @@ pub(crate) fn loss(
         let [width, height] = targets.grids[p.level];
         let locations = width * height;
         let stride = config.stride(p.level) as f32;
-        let [x, y] = middle(p.location, width, stride);
+        let [x, y] = cell_centre(p.location, width, stride);
         let sides: [f32; 4] = std::array::from_fn(|i| raw.boxes[p.level][i * locations + p.location]);
         let far = sides.map(|side| distance(side, stride));
         let found = [x - far[0], y - far[1], x + far[2], y + far[3]];
@@ -352,7 +352,7 @@ mod tests {
             let width = case.targets.grids[p.level][0];
             let locations = width * case.targets.grids[p.level][1];
             let stride = case.config.stride(p.level) as f32;
-            let [x, y] = middle(p.location, width, stride);
+            let [x, y] = cell_centre(p.location, width, stride);
             let [left, top, right, bottom] = case.targets.instances[p.instance].corners;
             let class = case.targets.instances[p.instance].class;
             case.scores[p.level][class * locations + p.location] = 20.0;

@@ -66,7 +66,8 @@ pub enum ModelError {
     },
     /// The detector was not trained on this object.
     #[error(
-        "the detector knows the objects {known}, not object {id}; train it (`sixfold train detector`), give other weights or a file of detections"
+        "the detector was trained on objects {known}, not on object {id}; train it (`sixfold train \
+         detector`), give other weights or a file of detections"
     )]
     UnknownObject {
         /// The requested object.
@@ -91,8 +92,8 @@ pub enum ModelError {
     Torchvision(PretrainedError),
     /// Error in the file next to weights of torchvision.
     #[error(
-        "{}: expected what the labels of the weights beside it mean, such as {{\"objects\": {{\"1\": 5, \"2\": 8}}}} with an object's id \
-         for each label, found {found}; correct or remove it", file.display()
+        "{}: expected the objects of the labels of the weights beside it, such as {{\"objects\": {{\"1\": \
+         5, \"2\": 8}}}} with an object's id for each label, found {found}; correct or remove it", file.display()
     )]
     Objects {
         /// The file.

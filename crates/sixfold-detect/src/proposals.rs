@@ -276,7 +276,7 @@ mod tests {
     }
 
     #[test]
-    fn the_detector_within_the_program_sees_objects_that_nobody_trained_on() {
+    fn the_built_in_detector_finds_objects_it_was_not_trained_on() {
         use crate::detector::TrainedDetector;
         use sixfold_estimator::ObjectDetector;
         use sixfold_geometry::Rect;

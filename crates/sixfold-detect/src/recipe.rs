@@ -73,7 +73,7 @@ pub struct DetectorRecipe {
     pub steps: u64,
     /// Images in a step.
     pub batch: usize,
-    /// Highest learning rate.
+    /// Maximum learning rate.
     pub learning_rate: f64,
     /// Learning rate of the pretrained encoder as a fraction of the learning rate, 0 to 1.
     pub encoder_share: f64,

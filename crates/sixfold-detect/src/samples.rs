@@ -365,8 +365,9 @@ impl TrainingImageSource {
         let centre = if anywhere {
             [random.random::<f32>() * width as f32, random.random::<f32>() * height as f32]
         } else {
-            let (_, _, middle) = photograph.instances[random.random_range(0..photograph.instances.len())];
-            middle.map(|m| m + uniform(random, [-reach, reach]))
+            let (_, _, instance_centre) =
+                photograph.instances[random.random_range(0..photograph.instances.len())];
+            instance_centre.map(|m| m + uniform(random, [-reach, reach]))
         };
         // The part should lie within the photograph if possible.
         let half = 0.35 * side as f32 * step;
@@ -377,10 +378,10 @@ impl TrainingImageSource {
         let centre = [clamped(centre[0], width), clamped(centre[1], height)];
         let (s, c) = turn.sin_cos();
         let (sx, sy) = (c * step, s * step);
-        let middle = 0.5 * (side as f32 - 1.0);
+        let half = 0.5 * (side as f32 - 1.0);
         let map = AffineMap {
-            x: [sx, -sy, centre[0] - (sx - sy) * middle],
-            y: [sy, sx, centre[1] - (sy + sx) * middle],
+            x: [sx, -sy, centre[0] - (sx - sy) * half],
+            y: [sy, sx, centre[1] - (sy + sx) * half],
         };
         let (patch, inside) = Patch::warp(&photograph.image, &map, side, side, [0.5; 3]);
         let mut canvas = if inside.data.iter().any(|v| *v < 0.5) && random.random::<bool>() {
@@ -428,8 +429,8 @@ impl TrainingImageSource {
     fn corner(&self, patch: &Patch, random: &mut Random) -> [i64; 2] {
         let side = self.options.size as f32;
         [patch.width, patch.height].map(|length| {
-            let middle = uniform(random, [0.02, 0.98]) * side;
-            (middle - 0.5 * length as f32).round() as i64
+            let centre_at = uniform(random, [0.02, 0.98]) * side;
+            (centre_at - 0.5 * length as f32).round() as i64
         })
     }
 
@@ -496,8 +497,8 @@ impl TrainingImageSource {
             }
             _ => {
                 let window = (1.5 * longest).ceil().max(8.0) as usize;
-                let middle = 0.5 * window as f32;
-                Shape::random(random).draw(window, window, [middle, middle], 0.35 * longest)
+                let half = 0.5 * window as f32;
+                Shape::random(random).draw(window, window, [half, half], 0.35 * longest)
             }
         };
         let patch = match random.random_range(0..10u32) {
@@ -518,12 +519,12 @@ impl TrainingImageSource {
         // A cube of side 1 fits into a ball of diameter 1.74, and its front is nearer than its centre.
         let size = (1.9 * longest).ceil().max(8.0) as usize;
         let focal = f64::from(longest) * (distance - 0.87);
-        let middle = 0.5 * (size as f64 - 1.0);
+        let principal = 0.5 * (size as f64 - 1.0);
         let camera = Camera {
             fx: focal,
             fy: focal,
-            cx: middle,
-            cy: middle,
+            cx: principal,
+            cy: principal,
             width: size,
             height: size,
             distortion: None,

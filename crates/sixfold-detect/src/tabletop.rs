@@ -90,8 +90,8 @@ fn placed(meshes: &[&Mesh], reach: f64, random: &mut Random) -> Vec<(usize, Pose
         let standing = random.random::<f32>() < STANDING;
         let turn =
             about_z * if standing { UnitQuaternion::identity() } else { random_rotation(random).rotation() };
-        let turned = meshes[index].transformed(&Pose::new(turn, Vec3::zeros()));
-        let (low, high) = turned.bounding_box();
+        let rotated = meshes[index].transformed(&Pose::new(turn, Vec3::zeros()));
+        let (low, high) = rotated.bounding_box();
         let size = high - low;
         let radius = 0.4 * size.x.max(size.y);
         let stacked = random.random::<f32>() < STACKED;
@@ -121,11 +121,18 @@ pub(crate) fn tabletop(
 ) -> Tabletop {
     let field = f64::from(uniform(random, FIELD));
     let focal = 0.5 * side as f64 / (0.5 * field).tan();
-    let middle = 0.5 * (side as f64 - 1.0);
+    let principal = 0.5 * (side as f64 - 1.0);
     let pixels = f64::from(uniform(random, PIXELS.map(f32::ln)).exp());
     let distance = focal * DIAMETER / pixels;
-    let camera =
-        Camera { fx: focal, fy: focal, cx: middle, cy: middle, width: side, height: side, distortion: None };
+    let camera = Camera {
+        fx: focal,
+        fy: focal,
+        cx: principal,
+        cy: principal,
+        width: side,
+        height: side,
+        distortion: None,
+    };
     let camera_from_table = looking_down(distance, random);
     let reach = 0.45 * side as f64 * distance / focal;
     let placed = placed(meshes, reach, random);

@@ -74,9 +74,9 @@ pub(crate) struct Targets {
 /// Smallest and largest size (square root of the box's area, pixels) of objects on a level; neighbours overlap.
 fn sizes(config: &DetectorConfig, level: usize) -> [f32; 2] {
     let stride = config.stride(level) as f32;
-    let least = if level == 0 { 0.0 } else { 3.5 * stride };
+    let minimum = if level == 0 { 0.0 } else { 3.5 * stride };
     let greatest = if level + 1 == config.levels { f32::INFINITY } else { 10.0 * stride };
-    [least, greatest]
+    [minimum, greatest]
 }
 
 /// The pixel at the centre of a location.
@@ -131,8 +131,8 @@ impl Targets {
             for (index, (instance, mut locations)) in annotation.instances.iter().zip(on_mask).enumerate() {
                 let [left, top, right, bottom] = instance.corners;
                 let size = ((right - left).max(1.0) * (bottom - top).max(1.0)).sqrt();
-                let [least, greatest] = sizes(config, level);
-                if !(least..greatest).contains(&size) || sums[index][2] == 0.0 {
+                let [minimum, greatest] = sizes(config, level);
+                if !(minimum..greatest).contains(&size) || sums[index][2] == 0.0 {
                     continue;
                 }
                 if locations.is_empty() {
@@ -217,7 +217,7 @@ mod tests {
     }
 
     #[test]
-    fn locations_lie_on_their_objects_near_the_middle() {
+    fn locations_are_on_their_objects_near_the_centre() {
         let annotation = annotation();
         let config = DetectorConfig::compact(3);
         let targets = Targets::new(&annotation, &config);
@@ -246,7 +246,7 @@ mod tests {
     }
 
     #[test]
-    fn masks_are_shares_of_blocks() {
+    fn masks_are_fractions_of_blocks() {
         let targets = Targets::new(&annotation(), &DetectorConfig::compact(3));
         let mask = &targets.masks[1];
         assert_eq!((mask.corner, mask.size), ([13, 3], [19, 21]));

@@ -80,8 +80,10 @@ impl Beside {
         if let Some((field, Some(found))) =
             sides.into_iter().find(|(_, s)| s.is_some_and(|s| !SIDES.contains(&s)))
         {
-            let (least, greatest) = (SIDES.start(), SIDES.end());
-            return Err(wrong(format!("{field} {found}, which is not within {least} to {greatest} pixels")));
+            let (minimum, greatest) = (SIDES.start(), SIDES.end());
+            return Err(wrong(format!(
+                "{field} {found}, which is not within {minimum} to {greatest} pixels"
+            )));
         }
         let count = objects.as_ref().map_or(1, BTreeMap::len);
         if count == 0 || count > MAX_LABELS {

@@ -3,10 +3,10 @@
 //! The dissertation stores successes only ("unsuccessful grasp attempts do not provide any information for replicating past
 //! experience", section 6.2.1), and ranks by the distance of an experience. Failures are informative too: they show how much worse
 //! than the planner assumes a grasp is at the edge of its friction cone, or far from the object's centre, with this gripper and
-//! these pads. So every attempt is stored with a dozen numbers that were known before it, and a logistic regression with a normal
-//! prior (Cox 1958; MAP by Newton's method) predicts the next one. The prior was fitted to simulated attempts: without attempts of
-//! its own, a gripper ranks grasps by the quality of the contacts and the agreement with experience, as in section 6.3.2, and keeps
-//! a distance from the table.
+//! these pads. So every attempt is stored with what was known before it, and a logistic regression on 16 numbers from that, with a
+//! normal prior (Cox 1958; MAP by Newton's method), predicts the next one. The prior was fitted to simulated attempts: without
+//! attempts of its own, a gripper ranks grasps by the quality of the contacts and the agreement with experience, as in section
+//! 6.3.2, and keeps a distance from the table.
 
 use sixfold_experience::Attempt;
 use sixfold_geometry::nalgebra::{SMatrix, SVector};
@@ -189,7 +189,7 @@ mod tests {
     }
 
     #[test]
-    fn it_learns_what_fails_with_this_hand_only() {
+    fn it_learns_failures_of_this_gripper_only() {
         // A gripper that loses objects held away from their centre, whatever the contacts: 3 of 4 times against 1 of 10.
         let mut random = ChaCha8Rng::seed_from_u64(3);
         let attempts: Vec<Attempt> = (0..200)
@@ -212,7 +212,7 @@ mod tests {
     }
 
     #[test]
-    fn walls_and_middles_are_learnt_apart() {
+    fn walls_and_centres_are_learned_separately() {
         // At a wall the pads must reach far, at the centre they must not: a sum of both inputs cannot express this.
         let of = |wall: bool, deep: bool| GraspDescription {
             lever: if wall { 0.045 } else { 0.0 },

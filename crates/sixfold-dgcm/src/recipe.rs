@@ -76,7 +76,7 @@ pub struct DgcmRecipe {
     pub steps: Option<u64>,
     /// Positive pairs in a step; the dissertation's network uses the same number of negative ones.
     pub pairs: Option<usize>,
-    /// Highest learning rate.
+    /// Maximum learning rate.
     pub learning_rate: Option<f64>,
     /// Weight of the loss of coordinates relative to that of features.
     pub lambda: Option<f64>,

@@ -291,7 +291,7 @@ mod tests {
     }
 
     #[test]
-    fn it_goes_on_where_it_stopped() {
+    fn it_resumes_from_its_last_checkpoint() {
         let pool = Pool::new(&GraspPoolOptions { views: 64, ..GraspPoolOptions::default() }, &()).unwrap();
         let device = Device::flex().autodiff();
         let default = DgcmTrainingOptions::default();

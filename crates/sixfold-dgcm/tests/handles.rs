@@ -56,8 +56,8 @@ fn seen(seed: u64, yaw: f64) -> Seen {
 impl Seen {
     /// The part in the centre between the pads of a grasp.
     fn part_of(&self, grasp: &Grasp) -> &'static str {
-        let middle = centre_between_pads(&grasp.camera_from_gripper);
-        self.mug.part_at(&self.camera_from_object.inverse().transform_point(&middle))
+        let centre = centre_between_pads(&grasp.camera_from_gripper);
+        self.mug.part_at(&self.camera_from_object.inverse().transform_point(&centre))
     }
 
     /// A grasp of the handle from outside.
@@ -97,7 +97,7 @@ fn as_published_the_network_alone_transfers_to_a_fixed_distance() {
     let fitter = GraspFitter::new(&now.view, &gripper, &planner).unwrap();
     let options = ProposeOptions::published();
     let found = propose(&fitter, &model, &mut memory, &options).unwrap();
-    assert!(!found.proposals.is_empty() && found.middles.is_empty());
+    assert!(!found.proposals.is_empty() && found.grasp_centres.is_empty());
     for p in &found.proposals {
         assert_eq!((p.hypothesis, p.moved), (AlignmentHypothesis::Scaled, 0.0));
         let reach = fitter.reach(&p.grasp.camera_from_gripper, gripper.max_opening).unwrap();
@@ -162,10 +162,10 @@ fn an_experience_on_a_handle_leads_to_the_handle_of_another_mug() {
         if let Some(p) = found.proposals.iter().find(|p| p.hypothesis == AlignmentHypothesis::Upright) {
             transferred += 1;
             let wanted = now.handle_grasp();
-            let turned = p.grasp.camera_from_gripper.rotation_angle_to(&wanted.camera_from_gripper);
+            let rotated_by = p.grasp.camera_from_gripper.rotation_angle_to(&wanted.camera_from_gripper);
             let half = Pose::exp(&[0.0, 0.0, 0.0, 0.0, 0.0, std::f64::consts::PI].into());
             let other = (p.grasp.camera_from_gripper * half).rotation_angle_to(&wanted.camera_from_gripper);
-            assert!(turned.min(other) < 0.7, "{there} to {here}: {turned} {other}");
+            assert!(rotated_by.min(other) < 0.7, "{there} to {here}: {rotated_by} {other}");
         }
         let geometry = antipodal_grasps(&now.view, &gripper, &planner).unwrap();
         let ranked = rank_on_part(&geometry, &found, &clusters, &fitter, &OutcomeModel::default());

@@ -107,7 +107,7 @@ fn errors(input: &Seen, experience: &Seen) -> Vec<(AlignmentHypothesis, f64, f64
 }
 
 #[test]
-fn a_grasp_goes_along_with_a_turn() {
+fn a_grasp_rotates_with_the_object() {
     let size = Vec3::new(0.14, 0.06, 0.08);
     let found = errors(&seen(size, 0.6), &seen(size, 0.1));
     assert!(found.iter().any(|(_, d, a)| *d < 0.012 && *a < 6.0), "{found:?}");

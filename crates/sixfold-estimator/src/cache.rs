@@ -156,7 +156,7 @@ mod tests {
     }
 
     #[test]
-    fn the_least_recently_used_goes_first_and_nothing_foreign_does() {
+    fn the_least_recently_used_is_removed_first_and_foreign_files_stay() {
         let root = tempfile::tempdir().unwrap();
         let cache = Cache::new(root.path(), 2500);
         std::fs::create_dir(root.path().join("photographs")).unwrap();

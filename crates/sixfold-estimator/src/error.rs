@@ -19,7 +19,7 @@ pub enum EstimatorError {
         what: &'static str,
         /// The method.
         method: &'static str,
-        /// What to do.
+        /// Advice.
         advice: &'static str,
     },
     /// The object cannot be prepared.
@@ -37,7 +37,7 @@ pub enum EstimatorError {
         what: &'static str,
         /// The method.
         method: &'static str,
-        /// What to do.
+        /// Advice.
         advice: &'static str,
     },
     /// The region cannot be searched; other regions of the image can.

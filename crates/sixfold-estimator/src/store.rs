@@ -112,7 +112,7 @@ pub enum StoreError {
     #[error(transparent)]
     Mesh(#[from] MeshFileError),
     /// A list of points through which no surface can be fitted.
-    #[error("{name}: no surface can be laid through its points")]
+    #[error("{name}: no surface can be fitted to its points")]
     NoSurface {
         /// The object.
         name: String,
@@ -617,8 +617,8 @@ fn loaded(name: &str, record: &ObjectRecord, folder: PathBuf) -> Result<Object, 
         let wrong =
             |what| StoreError::Record { name: name.to_owned(), path: folder.join("object.json"), what };
         let mut of_record = record.info(&read).map_err(wrong)?;
-        let (surface, laid) = with_surface(name, read)?;
-        if laid.is_some() {
+        let (surface, note) = with_surface(name, read)?;
+        if note.is_some() {
             // The surface through the points has a different box.
             let own = ModelInfo::of_mesh(&surface);
             (of_record.diameter, of_record.min, of_record.size) = (own.diameter, own.min, own.size);
@@ -634,7 +634,7 @@ fn with_surface(name: &str, mesh: Mesh) -> Result<(Mesh, Option<String>), StoreE
     if !mesh.faces().is_empty() {
         return Ok((mesh, None));
     }
-    let note = format!("{name} has points and no faces; a surface of small disks is laid through them");
+    let note = format!("{name} has points and no faces; a surface of small disks is fitted to them");
     let mesh = mesh.surfels().map_err(|source| StoreError::NoSurface { name: name.to_owned(), source })?;
     Ok((mesh, Some(note)))
 }
@@ -739,7 +739,7 @@ mod tests {
     }
 
     #[test]
-    fn two_who_change_an_object_at_once_are_one_after_the_other_and_readers_see_one_or_the_other() {
+    fn concurrent_changes_are_serialised_and_readers_see_a_consistent_object() {
         let root = tempfile::tempdir().unwrap();
         let store = ObjectStore::new(root.path());
         add(&store, 1.0, false, Ok(())).unwrap();
@@ -786,7 +786,7 @@ mod tests {
     }
 
     #[test]
-    fn a_broken_file_of_the_store_is_an_error_that_says_how_to_make_it_again() {
+    fn a_broken_file_of_the_store_is_an_error_with_advice() {
         let root = tempfile::tempdir().unwrap();
         let store = ObjectStore::new(root.path());
         add(&store, 1.0, false, Ok(())).unwrap();

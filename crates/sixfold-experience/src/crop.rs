@@ -275,8 +275,8 @@ mod tests {
     fn the_crop_covers_thirty_centimetres_around_the_object() {
         let (depth, camera, mask) = scene();
         let crop = Crop::new(&depth, &camera, &mask, &CropOptions::compact()).unwrap();
-        let middle = crop.camera.project(&Vec3::new(0.162, -0.0049, 0.8)).unwrap();
-        assert!((middle - Vec2::new(47.5, 47.5)).norm() < 1.5, "{middle}");
+        let projected = crop.camera.project(&Vec3::new(0.162, -0.0049, 0.8)).unwrap();
+        assert!((projected - Vec2::new(47.5, 47.5)).norm() < 1.5, "{projected}");
         // 10 of 30 cm squared, except for the edges, which have normals as well.
         let share = crop.pixels().count() as f64 / (96.0 * 96.0);
         assert!((share - 1.0 / 9.0).abs() < 0.02, "{share}");
@@ -292,7 +292,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_cut_out_says_why() {
+    fn errors_explain_why_a_crop_fails() {
         let (depth, camera, mask) = scene();
         let empty = Mask::filled(640, 480, false);
         let error = Crop::new(&depth, &camera, &empty, &CropOptions::compact()).unwrap_err();

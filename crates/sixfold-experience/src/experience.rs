@@ -150,7 +150,7 @@ fn copies(model: &dyn FeatureExtractor, crop: &Crop) -> Vec<Copy> {
         .iter()
         .map(|&angle| {
             let feature =
-                if angle == 0.0 { model.feature(crop) } else { model.feature(&crop.turned(angle, trim)) };
+                if angle == 0.0 { model.feature(crop) } else { model.feature(&crop.rotated(angle, trim)) };
             Copy { angle, feature }
         })
         .collect()

@@ -226,7 +226,7 @@ mod tests {
     use rand_chacha::ChaCha8Rng;
 
     #[test]
-    fn it_finds_what_a_plain_search_finds() {
+    fn it_agrees_with_a_brute_force_search() {
         let mut random = ChaCha8Rng::seed_from_u64(1);
         let mut draw = || -> Vec<f32> { (0..FEATURE).map(|_| random.random_range(-1.0f32..1.0)).collect() };
         let mut index = FeatureIndex::new("n");

@@ -91,7 +91,8 @@ pub enum StoreError {
     },
     /// The file is damaged.
     #[error(
-        "{}: the experience store is damaged ({reason}); what can still be read of it goes into a new store with `sixfold grasp store merge NEW.db {}`, or else take a copy of it from a backup", file.display(), file.display()
+        "{}: the experience store is damaged ({reason}); recover its readable part with `sixfold grasp \
+         store merge NEW.db {}`, or restore it from a backup", file.display(), file.display()
     )]
     Broken {
         /// The file.
@@ -131,7 +132,8 @@ pub enum StoreError {
     },
     /// The connection was lost before the server confirmed.
     #[error(
-        "{server}: the connection to the experience store was lost ({reason}); whether what was being stored has arrived is not known: do the same again, nothing is stored twice"
+        "{server}: the connection to the experience store was lost ({reason}); the last data may not have \
+         been stored: run the same again, nothing is stored twice"
     )]
     Lost {
         /// The server, without the password.
@@ -141,7 +143,8 @@ pub enum StoreError {
     },
     /// The server denies access with this address, or does not permit the operation.
     #[error(
-        "{server}: the server refuses ({reason}); check user, database and password (PGPASSWORD, or in the address) and what the user may do there"
+        "{server}: the server refuses ({reason}); check user, database and password (PGPASSWORD, or in the \
+         address) and the privileges of the user"
     )]
     Refused {
         /// The server, without the password.
@@ -151,7 +154,9 @@ pub enum StoreError {
     },
     /// The server's database lacks pgvector.
     #[error(
-        "{server}: the database has no extension `vector` ({reason}); install pgvector on the server (Debian: postgresql-VERSION-pgvector) and let an administrator say CREATE EXTENSION vector in this database"
+        "{server}: the database has no extension `vector` ({reason}); install pgvector on the server \
+         (Debian: postgresql-VERSION-pgvector) and let an administrator run CREATE EXTENSION vector in \
+         this database"
     )]
     Extension {
         /// The server, without the password.

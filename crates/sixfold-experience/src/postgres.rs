@@ -83,7 +83,7 @@ enum Access {
 /// Why a transaction failed.
 enum Failure {
     /// It did not begin: nothing was changed.
-    NotBegun(Error),
+    NotStarted(Error),
     Failed(Error),
 }
 
@@ -368,7 +368,7 @@ impl PostgresStore {
         };
         let mut done = attempt(&mut client, access, &work);
         // A connection that was lost while idle fails here, before anything was changed, so the work is repeated with a new one.
-        if let Err(Failure::NotBegun(error)) = &done
+        if let Err(Failure::NotStarted(error)) = &done
             && is_lost(error)
         {
             drop(client);
@@ -380,7 +380,7 @@ impl PostgresStore {
                 *kept = Some(client);
                 Ok(value)
             }
-            Err(Failure::NotBegun(error) | Failure::Failed(error)) => {
+            Err(Failure::NotStarted(error) | Failure::Failed(error)) => {
                 if !is_lost(&error) {
                     *kept = Some(client);
                 }
@@ -452,7 +452,7 @@ fn attempt<T>(
         // With this level, reads after waiting for the lock include everything committed before it was acquired.
         Access::Write => client.build_transaction().isolation_level(IsolationLevel::ReadCommitted),
     };
-    let mut transaction = begin.start().map_err(Failure::NotBegun)?;
+    let mut transaction = begin.start().map_err(Failure::NotStarted)?;
     if access == Access::Write {
         transaction.batch_execute(LOCK).map_err(Failure::Failed)?;
     }

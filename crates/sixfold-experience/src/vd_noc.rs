@@ -15,7 +15,7 @@ pub struct Extent {
 
 impl Extent {
     /// Lower bound of half extents, metres: a plane seen face-on has no thickness to divide by.
-    const LEAST: f64 = 0.002;
+    const MIN_HALF: f64 = 0.002;
 
     /// The extent of points in metres. `trim` is the fraction of points that is left out at both ends of each axis (flying pixels):
     /// 0 for equation 6.1 as published. `None` without points.
@@ -34,7 +34,7 @@ impl Extent {
         }
         Some(Extent {
             centre: (low + high) * 0.5,
-            half: ((high - low) * 0.5).sup(&Vec3::repeat(Self::LEAST)),
+            half: ((high - low) * 0.5).sup(&Vec3::repeat(Self::MIN_HALF)),
         })
     }
 

@@ -168,7 +168,7 @@ fn one_broken_row_is_named_costs_itself_alone_and_can_be_removed() {
 }
 
 #[test]
-fn what_is_left_of_a_truncated_store_is_saved() {
+fn readable_rows_of_a_truncated_store_are_saved() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("a.db");
     {
@@ -179,7 +179,7 @@ fn what_is_left_of_a_truncated_store_is_saved() {
         }
     }
     let whole = std::fs::read(&file).unwrap();
-    for (part, least) in [(0.9, 15), (0.6, 5), (0.1, 0)] {
+    for (part, minimum) in [(0.9, 15), (0.6, 5), (0.1, 0)] {
         let file = folder.path().join("truncated.db");
         std::fs::write(&file, &whole[..(whole.len() as f64 * part) as usize]).unwrap();
         let before = std::fs::read(&file).unwrap();
@@ -190,7 +190,7 @@ fn what_is_left_of_a_truncated_store_is_saved() {
         let store = place.open_to_save().unwrap();
         let numbers = store.numbers().unwrap();
         let read: Vec<_> = numbers.iter().filter_map(|id| store.get(*id).ok().flatten()).collect();
-        assert!(read.len() >= least && read.len() < 30, "{part}: {} of {}", read.len(), numbers.len());
+        assert!(read.len() >= minimum && read.len() < 30, "{part}: {} of {}", read.len(), numbers.len());
         assert!(read.iter().all(|stored| stored.experience.object == format!("object {}", stored.id - 1)));
         drop(store);
         assert_eq!(std::fs::read(&file).unwrap(), before, "the file is as it was");

@@ -174,7 +174,7 @@ fn stores_are_merged_forgotten_and_followed() {
 }
 
 #[test]
-fn a_store_of_version_1_keeps_what_it_holds() {
+fn a_store_of_version_1_keeps_its_contents() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("old.db");
     let id = SqliteStore::create(&file).unwrap().add(&experience(2)).unwrap().0;
@@ -198,7 +198,7 @@ fn a_store_of_version_1_keeps_what_it_holds() {
 }
 
 #[test]
-fn what_is_no_store_says_so() {
+fn a_file_that_is_no_store_is_reported() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("x.db");
     let error = SqliteStore::open(&file).unwrap_err().to_string();

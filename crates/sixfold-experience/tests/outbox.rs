@@ -198,7 +198,7 @@ fn a_copy_keeps_the_contract_whatever_the_remote_store_does() {
 }
 
 #[test]
-fn a_robot_goes_on_alone_and_delivers_later() {
+fn a_robot_continues_offline_and_delivers_later() {
     let folder = tempfile::tempdir().unwrap();
     let (fleet, file) = (folder.path().join("fleet.db"), folder.path().join("outbox.db"));
     let state = Arc::new(AtomicU32::new(AWAY));
@@ -236,7 +236,7 @@ fn a_robot_goes_on_alone_and_delivers_later() {
 }
 
 #[test]
-fn robots_share_what_they_learn() {
+fn robots_share_experiences() {
     let folder = tempfile::tempdir().unwrap();
     let fleet = folder.path().join("fleet.db");
     let state = Arc::new(AtomicU32::new(FINE));

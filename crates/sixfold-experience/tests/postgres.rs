@@ -164,7 +164,7 @@ fn robots_make_the_same_store_at_once() {
 }
 
 #[test]
-fn what_is_wrong_is_named_and_no_password_with_it() {
+fn errors_name_the_problem_without_the_password() {
     let Some(server) = Server::start() else { return };
     let open = |url: &str| {
         let error = PostgresStore::open(url).expect_err(url);
@@ -392,7 +392,7 @@ fn helper_process() {
 }
 
 #[test]
-fn what_waits_is_delivered_exactly_once_whoever_is_killed() {
+fn pending_experiences_are_delivered_exactly_once_despite_kills() {
     let Some(mut server) = Server::start() else { return };
     let kills = kills(6);
     let url = server.database("fleet");

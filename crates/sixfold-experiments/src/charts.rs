@@ -121,7 +121,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_chart_shows_what_its_results_say_and_a_change_is_noticed() {
+    fn a_chart_shows_its_results_and_a_change_is_detected() {
         let dir = tempfile::tempdir().unwrap();
         let at = |name: &str| dir.path().join(name);
         std::fs::write(at("r.json"), r#"{"rows": [["a", 0.5], ["b", 1.0]]}"#).unwrap();

@@ -54,7 +54,7 @@ pub enum CameraError {
         found: String,
         /// The expected values.
         expected: &'static str,
-        /// What to do.
+        /// Advice.
         advice: &'static str,
     },
     /// The intrinsics belong to an image of another size.
@@ -445,7 +445,7 @@ mod tests {
         }
 
         #[test]
-        fn a_resized_crop_sees_the_same_ray(x in -0.2..0.2f64, y in -0.2..0.2f64, z in 0.5..2.0f64) {
+        fn a_resized_crop_keeps_the_rays(x in -0.2..0.2f64, y in -0.2..0.2f64, z in 0.5..2.0f64) {
             let point = Vec3::new(x, y, z);
             let rect = Rect { x: 100.0, y: 50.0, width: 200.0, height: 100.0 };
             let small = camera().crop(&rect).resize(100, 50);

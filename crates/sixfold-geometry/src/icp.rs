@@ -16,7 +16,8 @@ use crate::{Camera, DepthImage, NormalImage, PointCloud, Pose, Vec2, Vec3};
 pub enum IcpError {
     /// Too few points have a correspondence.
     #[error(
-        "{found} of {points} points found a partner within {distance:.4} m, at least {needed} are needed: start from a better pose or raise the rejection distance"
+        "{found} of {points} points have a correspondence within {distance:.4} m, at least {needed} are \
+         needed: start from a better pose or raise the rejection distance"
     )]
     TooFewCorrespondences {
         /// Pairs found.
@@ -29,7 +30,7 @@ pub enum IcpError {
         needed: usize,
     },
     /// The object can slide on the surface (a plane, a sphere), so the pose is not determined.
-    #[error("the correspondences do not fix all six degrees of freedom")]
+    #[error("the correspondences do not determine all six degrees of freedom")]
     Degenerate,
     /// The target has no normals.
     #[error("the target cloud has {normals} normals for {points} points: point-to-plane needs one each")]
@@ -231,9 +232,9 @@ pub fn icp(
         for _ in 0..level.iterations {
             let mut equations = NormalEquations::default();
             let mut squares = 0.0;
-            let mut looked = 0;
+            let mut examined = 0;
             for i in (0..source.len()).step_by(level.stride) {
-                looked += 1;
+                examined += 1;
                 let p = pose.transform_point(&source.points[i]);
                 let Some((q, n)) = target.partner(&p, level.rejection_distance) else { continue };
                 if with_normals && pose.transform_direction(&source.normals[i]).dot(&n) < cosine {
@@ -249,7 +250,7 @@ pub fn icp(
             if equations.count < options.min_correspondences {
                 return Err(IcpError::TooFewCorrespondences {
                     found: equations.count,
-                    points: looked,
+                    points: examined,
                     distance: level.rejection_distance,
                     needed: options.min_correspondences,
                 });

@@ -12,7 +12,8 @@ use crate::{Mat3, Pose, Vec3};
 pub enum AlignmentError {
     /// The lists have different lengths.
     #[error(
-        "{source_points} source points, {target_points} target points, {weights} weights: all must be equally many"
+        "{source_points} source points, {target_points} target points, {weights} weights: expected equal \
+         numbers"
     )]
     Lengths {
         /// Length of the first list.
@@ -33,7 +34,7 @@ pub enum AlignmentError {
         found: f64,
     },
     /// Fewer than three points carry weight, or they lie on one line.
-    #[error("the points do not fix a rotation: at least three that are not on one line are needed")]
+    #[error("the points do not determine a rotation: three or more that are not collinear are needed")]
     Degenerate,
 }
 

@@ -92,8 +92,8 @@ impl KdTree {
         }
         let side = |axis: usize| bounds.high[axis] - bounds.low[axis];
         let axis = (1..3).fold(0, |longest, axis| if side(axis) > side(longest) { axis } else { longest });
-        let middle = buckets.start + buckets.len() / 2;
-        let first = self.start(middle) - self.start(buckets.start);
+        let half = buckets.start + buckets.len() / 2;
+        let first = self.start(half) - self.start(buckets.start);
         // Equal coordinates are sorted by index, so that equal points form a tree over their indices, which is quick to
         // search.
         let order = |a: &Entry, b: &Entry| a.0[axis].total_cmp(&b.0[axis]).then(a.1.cmp(&b.1));
@@ -103,8 +103,8 @@ impl KdTree {
         below.high[axis] = cut;
         above.low[axis] = cut;
         let lowest = [
-            self.build(2 * node + 1, buckets.start..middle, below, left),
-            self.build(2 * node + 2, middle..buckets.end, above, right),
+            self.build(2 * node + 1, buckets.start..half, below, left),
+            self.build(2 * node + 2, half..buckets.end, above, right),
         ];
         self.nodes[node] = Node { axis, cut, lowest };
         lowest[0].min(lowest[1])

@@ -267,7 +267,7 @@ mod tests {
         }
 
         #[test]
-        fn composition_is_application_in_turn(a in twist(), b in twist(), x in prop::array::uniform3(-1.0..1.0f64)) {
+        fn composition_applies_in_sequence(a in twist(), b in twist(), x in prop::array::uniform3(-1.0..1.0f64)) {
             let (a, b, x) = (Pose::exp(&a), Pose::exp(&b), Vec3::from(x));
             let in_turn = a.transform_point(&b.transform_point(&x));
             prop_assert!(((a * b).transform_point(&x) - in_turn).norm() < 1e-12);

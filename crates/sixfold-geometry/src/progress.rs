@@ -34,15 +34,15 @@ mod tests {
     }
 
     #[test]
-    fn a_closure_is_told_of_every_part_and_may_stop_it() {
-        let told = AtomicUsize::new(0);
+    fn a_closure_receives_every_part_and_can_stop_it() {
+        let reported = AtomicUsize::new(0);
         let until = |last: usize| {
-            told.store(0, Ordering::Relaxed);
+            reported.store(0, Ordering::Relaxed);
             let sum = count(4, &|done, total| {
-                assert_eq!((told.fetch_add(1, Ordering::Relaxed) + 1, 4), (done, total));
+                assert_eq!((reported.fetch_add(1, Ordering::Relaxed) + 1, 4), (done, total));
                 done < last
             });
-            (sum, told.load(Ordering::Relaxed))
+            (sum, reported.load(Ordering::Relaxed))
         };
         assert_eq!(until(9), (Some(10), 4));
         assert_eq!(until(2), (None, 2));

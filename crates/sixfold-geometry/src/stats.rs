@@ -18,8 +18,8 @@ pub fn upper_median(values: &mut [f64]) -> Option<f64> {
     if values.is_empty() {
         return None;
     }
-    let middle = values.len() / 2;
-    Some(*values.select_nth_unstable_by(middle, f64::total_cmp).1)
+    let half = values.len() / 2;
+    Some(*values.select_nth_unstable_by(half, f64::total_cmp).1)
 }
 
 /// The logistic function, for a network's output: between 0 and 1.

@@ -67,7 +67,7 @@ pub fn undistort_box(region: &Rect, lens: &Camera) -> Rect {
 fn resample<T: Clone + Send + Sync>(
     raw: &Image<T>,
     camera: &Camera,
-    look: impl Fn(&Image<T>, Vec2) -> T + Sync,
+    sample: impl Fn(&Image<T>, Vec2) -> T + Sync,
 ) -> Result<Image<T>, CameraError> {
     camera.check_image(raw.width(), raw.height())?;
     if camera.distortion.is_none() {
@@ -76,7 +76,7 @@ fn resample<T: Clone + Send + Sync>(
     let mut out = raw.clone();
     out.as_mut_slice().par_chunks_mut(raw.width()).enumerate().for_each(|(y, row)| {
         for (x, pixel) in row.iter_mut().enumerate() {
-            *pixel = look(raw, camera.distort_point(&Vec2::new(x as f64, y as f64)));
+            *pixel = sample(raw, camera.distort_point(&Vec2::new(x as f64, y as f64)));
         }
     });
     Ok(out)

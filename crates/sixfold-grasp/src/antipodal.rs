@@ -403,11 +403,11 @@ impl<'a> Planner<'a> {
         if angle > self.cone || all == 0 {
             return None;
         }
-        let middle: Vec3 =
+        let midpoint: Vec3 =
             between.iter().map(|(i, _)| self.object.cloud.points[*i]).sum::<Vec3>() / between.len() as f64;
         // The horizontal distance from the centre of the points between the pads to the vertical line through the object's centre,
         // without its component along the closing axis, which loads the friction of the pads with no torque.
-        let lever = self.centre - middle;
+        let lever = self.centre - midpoint;
         let lever = lever - self.down * lever.dot(&self.down);
         let across = lever - closing * lever.dot(&closing);
         Some(AntipodalQuality {

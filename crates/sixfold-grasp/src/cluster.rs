@@ -69,7 +69,7 @@ mod tests {
     }
 
     #[test]
-    fn near_ones_are_joined_and_the_half_turn_is_near() {
+    fn near_grasps_are_joined_also_if_rotated_by_180_degrees() {
         let pi = std::f64::consts::PI;
         let grasps = [
             grasp([0.0, 0.0, 0.5, 0.0, 0.0, 0.0], 0.5),

@@ -104,7 +104,7 @@ mod tests {
     use crate::gripper_pose;
 
     #[test]
-    fn the_palm_keeps_out_of_what_nobody_saw_behind_a_surface() {
+    fn the_palm_avoids_unobserved_space_behind_a_surface() {
         let gripper = Gripper::built_in("jaws-85").unwrap();
         // The camera views a plate half a metre away along z, with nothing behind it.
         let mut plate = vec![];

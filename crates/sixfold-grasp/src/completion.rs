@@ -86,10 +86,10 @@ pub fn complete_by_mirrors(view: &GraspView, options: &CompletionOptions) -> Com
         let mut along: Vec<f64> = probes.iter().map(|p| normal.dot(p)).collect();
         along.sort_by(f64::total_cmp);
         let at = |share: f64| along[(share * (along.len() - 1) as f64) as usize];
-        let middle = 0.5 * (at(0.02) + at(0.98));
+        let centre = 0.5 * (at(0.02) + at(0.98));
         let best = (-options.shifts..=options.shifts)
             .filter_map(|shift| {
-                let plane = Plane { normal, offset: middle + f64::from(shift) * options.step };
+                let plane = Plane { normal, offset: centre + f64::from(shift) * options.step };
                 judge(view, &probes, &plane, options).map(|score| (score, plane))
             })
             .fold(None, |best: Option<(f64, Plane)>, next| match best {

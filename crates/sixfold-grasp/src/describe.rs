@@ -50,7 +50,7 @@ mod tests {
     use crate::{AntipodalOptions, GraspView, Gripper, gripper_pose};
 
     #[test]
-    fn a_bar_held_off_its_middle() {
+    fn a_bar_held_off_its_centre() {
         // A bar of 20 x 2 x 6 cm on a table, its long side along x, seen from above (the camera looks down the z axis).
         let mut object = PointCloud::default();
         for i in 0..=100 {

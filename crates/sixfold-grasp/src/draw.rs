@@ -76,7 +76,7 @@ mod tests {
     use sixfold_geometry::{Image, Vec3};
 
     #[test]
-    fn the_gripper_is_drawn_where_it_is_and_fainter_behind_something() {
+    fn the_gripper_is_drawn_at_its_pose_and_fainter_where_hidden() {
         let camera = Camera::new(500.0, 500.0, 79.5, 59.5, 160, 120).unwrap();
         let gripper = Gripper::built_in("jaws-85").unwrap();
         let pose = gripper_pose(&Vec3::new(0.0, 0.0, 0.6), &Vec3::y(), &Vec3::x()).unwrap();

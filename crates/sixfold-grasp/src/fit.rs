@@ -116,7 +116,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_assumed_gets_more_room_where_there_is_any() {
+    fn assumed_surface_gets_more_clearance_where_possible() {
         let gripper = Gripper::built_in("jaws-85").unwrap();
         let options = AntipodalOptions::default();
         let tip = Vec3::new(0.0, 0.0, 0.58);

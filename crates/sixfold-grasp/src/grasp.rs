@@ -58,8 +58,8 @@ impl Grasp {
     pub fn difference(&self, other: &Grasp) -> (f64, f64) {
         let flipped = other.camera_from_gripper * half_turn();
         let angle = self.camera_from_gripper.rotation_angle_to(&other.camera_from_gripper);
-        let turned = self.camera_from_gripper.rotation_angle_to(&flipped);
-        (self.camera_from_gripper.distance_to(&other.camera_from_gripper), angle.min(turned))
+        let flipped_angle = self.camera_from_gripper.rotation_angle_to(&flipped);
+        (self.camera_from_gripper.distance_to(&other.camera_from_gripper), angle.min(flipped_angle))
     }
 }
 
@@ -96,7 +96,7 @@ mod tests {
     }
 
     #[test]
-    fn half_a_turn_is_the_same_gripper() {
+    fn a_rotation_by_180_degrees_is_the_same_grasp() {
         let quality = AntipodalQuality { alignment: 1.0, support: 1.0, centring: 1.0, observed: 1.0 };
         let a = Grasp {
             camera_from_gripper: Pose::exp(&[0.1, 0.2, 0.6, 0.3, 2.0, 0.1].into()),

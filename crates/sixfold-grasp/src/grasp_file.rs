@@ -158,7 +158,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_is_wrong_with_a_file_of_grasps_is_named() {
+    fn errors_of_a_grasp_file_are_named() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("grasp.json");
         let eye = "[[1,0,0,0.1],[0,1,0,0],[0,0,1,0.7],[0,0,0,1]]";

@@ -38,7 +38,8 @@ pub enum ViewError {
     Depth(#[from] DepthImageError),
     /// There is no plane that could be a table.
     #[error(
-        "no plane holds {share:.0} % of the measured points, so no table was found: give a mask of the object"
+        "no plane contains {share:.0} % of the measured points, so no table was found: give a mask of the \
+         object"
     )]
     NoTable {
         /// Minimum fraction of the points, in per cent.
@@ -61,7 +62,8 @@ pub enum ViewError {
     },
     /// The mask covers separate objects.
     #[error(
-        "the mask covers {parts} things that lie apart (the largest two have {first} and {second} pixels), expected one object: split the mask"
+        "the mask covers {parts} separate parts (the largest two have {first} and {second} pixels), \
+         expected one object: split the mask"
     )]
     SeveralObjects {
         /// Number of parts.

@@ -229,7 +229,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_killed_writer_left_behind_goes_with_the_next_write() {
+    fn leftovers_of_a_killed_writer_are_removed_by_the_next_write() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("record.json");
         for number in 0..3 {

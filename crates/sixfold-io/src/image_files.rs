@@ -336,7 +336,7 @@ mod tests {
     }
 
     #[test]
-    fn truncated_lying_and_foreign_files_are_named() {
+    fn errors_name_truncated_inconsistent_and_foreign_files() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("000007.png");
         let png = depth_png();
@@ -345,12 +345,12 @@ mod tests {
         assert!(message.contains("000007.png") && message.contains("not a readable image"), "{message}");
 
         // A header of 30000 x 30000 (with its own right checksum) before the same few bytes.
-        let mut lying = png.clone();
-        lying[16..20].copy_from_slice(&30000u32.to_be_bytes());
-        lying[20..24].copy_from_slice(&30000u32.to_be_bytes());
-        let crc = crc32(&lying[12..29]);
-        lying[29..33].copy_from_slice(&crc.to_be_bytes());
-        std::fs::write(&path, &lying).unwrap();
+        let mut wrong_size = png.clone();
+        wrong_size[16..20].copy_from_slice(&30000u32.to_be_bytes());
+        wrong_size[20..24].copy_from_slice(&30000u32.to_be_bytes());
+        let crc = crc32(&wrong_size[12..29]);
+        wrong_size[29..33].copy_from_slice(&crc.to_be_bytes());
+        std::fs::write(&path, &wrong_size).unwrap();
         let message = file(&path).depth(1e-3).unwrap_err().to_string();
         assert!(message.contains("30000x30000"), "{message}");
         let unlimited = ImageFile::new(&path).with_limit(u64::MAX);

@@ -420,8 +420,8 @@ mod tests {
         let pose = Pose::exp(&[0.1, 0.2, 0.3, 0.7, -0.2, 0.4].into());
         for thickness in [1e-3, 1e-5, 1e-7] {
             let plate = grid([30, 20, 1], [0.3, 0.2, thickness]);
-            let turned: Vec<Vec3> = plate.iter().map(|p| pose.transform_point(p)).collect();
-            for points in [plate, turned] {
+            let rotated: Vec<Vec3> = plate.iter().map(|p| pose.transform_point(p)).collect();
+            for points in [plate, rotated] {
                 let hull = hull_of(&points);
                 let expected = 0.3 * 0.2 * thickness;
                 assert!((volume(&hull) - expected).abs() < 1e-2 * expected, "{} {expected}", volume(&hull));
@@ -448,11 +448,11 @@ mod tests {
     fn meshes_without_a_volume_have_no_hull() {
         let pose = Pose::exp(&[0.1, 0.2, 0.3, 0.7, -0.2, 0.4].into());
         let sheet: Vec<Vec3> = grid([9, 7, 1], [0.3, 0.2, 0.0]);
-        let turned = sheet.iter().map(|p| pose.transform_point(p)).collect();
+        let rotated = sheet.iter().map(|p| pose.transform_point(p)).collect();
         let line = (0..50).map(|i| Vec3::new(0.1, -0.2, 0.3) * f64::from(i)).collect();
         let point = vec![Vec3::new(1.0, 2.0, 3.0); 20];
         let few = vec![Vec3::zeros(), Vec3::x(), Vec3::y()];
-        for points in [sheet, turned, line, point, few, vec![Vec3::x()]] {
+        for points in [sheet, rotated, line, point, few, vec![Vec3::x()]] {
             let hull = Mesh::new(points, vec![]).unwrap().convex_hull();
             assert_eq!(hull, Err(MeshError::Empty));
         }
@@ -477,8 +477,8 @@ mod tests {
         let pose = Pose::exp(&twist.into());
         let straight: Vec<Vec3> =
             points.iter().chain(&corners).map(|p| Vec3::from(p.map(f64::from))).collect();
-        let turned: Vec<Vec3> = straight.iter().map(|p| pose.transform_point(p)).collect();
-        let volumes = [straight, turned].map(|points| volume(&hull_of(&points)));
+        let rotated: Vec<Vec3> = straight.iter().map(|p| pose.transform_point(p)).collect();
+        let volumes = [straight, rotated].map(|points| volume(&hull_of(&points)));
         assert!((volumes[0] - volumes[1]).abs() < 1e-6, "{volumes:?}");
     }
 
@@ -503,8 +503,8 @@ mod tests {
             let points = points.iter().chain(&corners).map(|p| Vec3::from(p.map(f64::from)));
             let straight: Vec<Vec3> = points.collect();
             let pose = Pose::exp(&twist.into());
-            let turned: Vec<Vec3> = straight.iter().map(|p| pose.transform_point(p)).collect();
-            let volumes = [straight, turned].map(|points| volume(&hull_of(&points)));
+            let rotated: Vec<Vec3> = straight.iter().map(|p| pose.transform_point(p)).collect();
+            let volumes = [straight, rotated].map(|points| volume(&hull_of(&points)));
             prop_assert!((volumes[0] - volumes[1]).abs() < 1e-6, "{volumes:?}");
         }
     }

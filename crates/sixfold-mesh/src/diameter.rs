@@ -91,7 +91,7 @@ impl Bounds {
 struct Node {
     bounds: Bounds,
     /// The centre of the box.
-    middle: Vec3,
+    centre: Vec3,
     /// The distance of the farthest point from the centre, rounded up.
     radius: f64,
     start: usize,
@@ -103,24 +103,24 @@ struct Node {
 fn build(points: &mut [Vec3], start: usize, end: usize, nodes: &mut Vec<Node>) {
     let here = nodes.len();
     let bounds = Bounds::of(&points[start..end]);
-    let middle = bounds.low + (bounds.high - bounds.low) * 0.5;
-    let radius = points[start..end].iter().map(|p| (p - middle).norm_squared()).fold(0.0, f64::max).sqrt();
-    nodes.push(Node { bounds, middle, radius: radius * ROUND_UP, start, end, right: 0 });
+    let centre = bounds.low + (bounds.high - bounds.low) * 0.5;
+    let radius = points[start..end].iter().map(|p| (p - centre).norm_squared()).fold(0.0, f64::max).sqrt();
+    nodes.push(Node { bounds, centre, radius: radius * ROUND_UP, start, end, right: 0 });
     if end - start <= LEAF {
         return;
     }
     let axis = (bounds.high - bounds.low).imax();
-    let middle = start + (end - start) / 2;
-    points[start..end].select_nth_unstable_by(middle - start, |a, b| a[axis].total_cmp(&b[axis]));
-    build(points, start, middle, nodes);
+    let half = start + (end - start) / 2;
+    points[start..end].select_nth_unstable_by(half - start, |a, b| a[axis].total_cmp(&b[axis]));
+    build(points, start, half, nodes);
     nodes[here].right = nodes.len();
-    build(points, middle, end, nodes);
+    build(points, half, end, nodes);
 }
 
 impl Node {
     /// An upper bound of the squared distance of a point in this node and one in the other.
     fn bound(&self, other: &Node) -> f64 {
-        let by_balls = ((self.middle - other.middle).norm() + self.radius + other.radius) * ROUND_UP;
+        let by_balls = ((self.centre - other.centre).norm() + self.radius + other.radius) * ROUND_UP;
         self.bounds.span_squared(&other.bounds).min(by_balls * by_balls)
     }
 }

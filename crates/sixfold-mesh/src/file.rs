@@ -19,11 +19,12 @@ pub const LARGEST_DIAMETER: f64 = 5.0;
 /// Largest distance of an object from the origin of its frame that [`read_mesh`] accepts, in metres: single precision still
 /// resolves a tenth of a millimetre there.
 pub const LARGEST_OFFSET: f64 = 1000.0;
-/// Largest area that [`read_mesh`] accepts, in squares of the diameter. Objects with all their inner walls reach tens. Thousands
-/// of faces on top of each other take minutes to render and are not an object.
+/// Largest area that [`read_mesh`] accepts, in squares of the diameter; a mesh with more than this in squares of the longest side
+/// of its bounding box is first freed of repeated faces. Objects with all their inner walls reach tens. Thousands of faces on top
+/// of each other take minutes to render and are not an object.
 pub const LARGEST_AREA: f64 = 1000.0;
 /// Limit on the bytes of all files together that a mesh file refers to.
-const MOST_NAMED: u64 = 4 << 30;
+const MAX_NAMED: u64 = 4 << 30;
 
 /// Options of [`read_mesh_with`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -156,8 +157,8 @@ impl Beside<'_> {
         }
         let bytes = read_regular(&real, limits::IMAGE)?;
         self.read.set(self.read.get() + bytes.len() as u64);
-        if self.read.get() > MOST_NAMED {
-            let message = format!("the files that it names have more than {} MB in all", MOST_NAMED >> 20);
+        if self.read.get() > MAX_NAMED {
+            let message = format!("the files that it names have more than {} MB in all", MAX_NAMED >> 20);
             return Err(io::Error::new(io::ErrorKind::FileTooLarge, message));
         }
         Ok(bytes)

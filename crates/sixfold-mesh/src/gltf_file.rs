@@ -646,7 +646,7 @@ mod tests {
     }
 
     #[test]
-    fn lying_files_are_explained() {
+    fn files_with_wrong_counts_are_explained() {
         let json = document(MIRRORED, "", 0, "");
         let with = |from: &str, to: &str| {
             assert!(json.contains(from), "{from}");

@@ -211,9 +211,9 @@ impl Mesh {
     }
 }
 
-/// A unit vector; `None` if the length is `least` or less, not finite, or too large to be computed.
-pub(crate) fn direction(vector: &Vec3, least: f64) -> Option<Vec3> {
-    vector.try_normalize(least).filter(|n| (n.norm() - 1.0).abs() < 1e-6)
+/// A unit vector; `None` if the length is `minimum` or less, not finite, or too large to be computed.
+pub(crate) fn direction(vector: &Vec3, minimum: f64) -> Option<Vec3> {
+    vector.try_normalize(minimum).filter(|n| (n.norm() - 1.0).abs() < 1e-6)
 }
 
 /// The content of a file before it is checked.

@@ -17,9 +17,9 @@ const MILLIMETRE: f64 = 1e-3;
 /// Largest number accepted in the file: a kilometre. Larger numbers lose digits, or overflow when squared.
 const LARGEST: f64 = 1e6;
 /// Largest number of discrete symmetries of an object: nuts have 12, a dodecahedron 60.
-const MOST_DISCRETE: usize = 512;
+const MAX_DISCRETE: usize = 512;
 /// Largest number of symmetries of an object with continuous ones in BOP's steps: 12 discrete ones about four axes.
-const MOST_SYMMETRIES: usize = 16_384;
+const MAX_SYMMETRIES: usize = 16_384;
 
 /// A symmetry under every rotation about an axis.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -252,15 +252,15 @@ impl Fields<'_> {
     fn check_counts(&self) -> Result<(), MeshFileError> {
         let (discrete, continuous) =
             (self.list("symmetries_discrete")?.len(), self.list("symmetries_continuous")?.len());
-        if discrete > MOST_DISCRETE {
-            let expected = format!("at most {MOST_DISCRETE} symmetries");
+        if discrete > MAX_DISCRETE {
+            let expected = format!("at most {MAX_DISCRETE} symmetries");
             return Err(self.error("symmetries_discrete", &expected, discrete.to_string()));
         }
         let steps = (std::f64::consts::PI / ModelInfo::BOP_MAX_STEP).ceil() as usize;
         let all = (1 + discrete).saturating_mul(continuous.saturating_mul(steps).max(1));
-        if all > MOST_SYMMETRIES {
+        if all > MAX_SYMMETRIES {
             let expected = format!(
-                "at most {MOST_SYMMETRIES} symmetries, with each discrete one at each step of each axis"
+                "at most {MAX_SYMMETRIES} symmetries, with each discrete one at each step of each axis"
             );
             return Err(self.error("symmetries_continuous", &expected, all.to_string()));
         }

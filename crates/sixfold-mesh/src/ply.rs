@@ -89,7 +89,7 @@ impl Element {
     }
 
     /// The minimum number of bytes of a row in the body.
-    fn least_bytes(&self, encoding: Encoding) -> usize {
+    fn min_bytes(&self, encoding: Encoding) -> usize {
         match encoding {
             // A digit and a separator.
             Encoding::Ascii => 2 * self.properties.len(),
@@ -423,18 +423,18 @@ pub fn parse_ply(
     let mut seen_vertices = false;
     let mut list = Vec::new();
     for element in &header.elements {
-        let least = element.least_bytes(header.encoding);
+        let minimum = element.min_bytes(header.encoding);
         // The last line may lack its end.
         let available = body.left() + usize::from(header.encoding == Encoding::Ascii);
-        if element.count.checked_mul(least).is_none_or(|needed| needed > available) {
+        if element.count.checked_mul(minimum).is_none_or(|needed| needed > available) {
             return Err(MeshFileError::field(
                 file,
                 format!("element {}", element.name),
-                format!("{} rows of at least {least} bytes each", element.count),
+                format!("{} rows of at least {minimum} bytes each", element.count),
                 format!("{} bytes up to the end of the file; it is cut off or its header lies", body.left()),
             ));
         }
-        if least == 0 {
+        if minimum == 0 {
             continue;
         }
         match element.name.as_str() {
@@ -777,7 +777,7 @@ mod tests {
     }
 
     #[test]
-    fn lying_files_are_explained_without_taking_memory() {
+    fn files_with_wrong_counts_are_explained_without_allocation() {
         for (from, to, names) in [
             (
                 "vertex 4",

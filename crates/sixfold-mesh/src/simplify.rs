@@ -199,13 +199,13 @@ impl Collapser {
         let mut quadric = self.quadrics[i as usize];
         quadric.add(&self.quadrics[j as usize]);
         let (p, q) = (self.points[i as usize], self.points[j as usize]);
-        let middle = (p + q) * 0.5;
+        let midpoint = (p + q) * 0.5;
         let length = (p - q).norm();
-        let mut best = [p, q, middle]
+        let mut best = [p, q, midpoint]
             .into_iter()
             .map(|x| (quadric.error(&x), x))
             .min_by(|x, y| x.0.total_cmp(&y.0))
-            .unwrap_or((f64::INFINITY, middle));
+            .unwrap_or((f64::INFINITY, midpoint));
         // Equation 1 of the paper, where the matrix is far from singular and the point stays near.
         let scale = quadric.a.trace();
         if quadric.a.determinant() > 1e-6 * (scale / 3.0).powi(3)
@@ -213,7 +213,7 @@ impl Collapser {
         {
             let x = -(inverse * quadric.b);
             let error = quadric.error(&x);
-            if (x - middle).norm() < 2.0 * length && error <= best.0 {
+            if (x - midpoint).norm() < 2.0 * length && error <= best.0 {
                 best = (error, x);
             }
         }
@@ -490,8 +490,8 @@ mod tests {
             let points: Vec<Vec3> = points.into_iter().map(Vec3::from).collect();
             let query = Vec3::from(query);
             let found = KdTree::new(&points).nearest(&query).unwrap().index;
-            let least = points.iter().map(|p| (p - query).norm_squared()).fold(f64::INFINITY, f64::min);
-            prop_assert_eq!((points[found] - query).norm_squared(), least);
+            let minimum = points.iter().map(|p| (p - query).norm_squared()).fold(f64::INFINITY, f64::min);
+            prop_assert_eq!((points[found] - query).norm_squared(), minimum);
         }
     }
 }

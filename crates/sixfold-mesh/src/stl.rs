@@ -178,13 +178,13 @@ mod tests {
     }
 
     #[test]
-    fn lying_files_are_explained() {
-        let mut lying = binary(&[b' '; 80]);
-        lying[80..84].copy_from_slice(&4_000_000_000u32.to_le_bytes());
+    fn files_with_wrong_counts_are_explained() {
+        let mut wrong_count = binary(&[b' '; 80]);
+        wrong_count[80..84].copy_from_slice(&4_000_000_000u32.to_le_bytes());
         let mut nan = binary(&[b' '; 80]);
         nan[84 + 12..84 + 16].copy_from_slice(&f32::NAN.to_le_bytes());
         for (bytes, names) in [
-            (lying, ["triangle count", "at most 2", "4000000000"]),
+            (wrong_count, ["triangle count", "at most 2", "4000000000"]),
             (nan, ["triangle 0 of 2", "finite", "NaN"]),
             (vec![0; 30], ["header", "84 bytes", "30 bytes"]),
             (TWO.replace("1 1 0", "1 x 0").into_bytes(), ["line 6", "three finite", "vertex 1 x 0"]),

@@ -67,14 +67,14 @@ impl Surface {
             return;
         }
         let axis = (high - low).imax();
-        let middle = triangles.len() / 2;
+        let half = triangles.len() / 2;
         let place = |t: &([Vec3; 3], u32)| t.0.iter().map(|c| c[axis]).sum::<f64>();
-        triangles.select_nth_unstable_by(middle, |a, b| place(a).total_cmp(&place(b)).then(a.1.cmp(&b.1)));
-        let (left, right) = triangles.split_at_mut(middle);
+        triangles.select_nth_unstable_by(half, |a, b| place(a).total_cmp(&place(b)).then(a.1.cmp(&b.1)));
+        let (left, right) = triangles.split_at_mut(half);
         self.build(left, first);
         self.nodes[node].next = self.nodes.len() as u32;
         self.nodes[node].count = 0;
-        self.build(right, first + middle);
+        self.build(right, first + half);
     }
 
     /// The nearest surface point to `p`, metres.
@@ -173,16 +173,16 @@ mod tests {
             let p = point(random) * 2.0;
             let found = Surface::new(&mesh).nearest(&p);
             prop_assert!(((p - found.point).norm() - found.distance).abs() < 1e-12);
-            let mut least = f64::INFINITY;
+            let mut minimum = f64::INFINITY;
             for face in 0..count {
                 let [a, b, c] = mesh.triangle(face);
                 for (i, j) in (0..=20).flat_map(|i| (0..=20 - i).map(move |j| (i, j))) {
                     let (u, v) = (f64::from(i) / 20.0, f64::from(j) / 20.0);
-                    least = least.min((p - (a * (1.0 - u - v) + b * u + c * v)).norm());
+                    minimum = minimum.min((p - (a * (1.0 - u - v) + b * u + c * v)).norm());
                 }
             }
-            prop_assert!(found.distance <= least + 1e-12, "{} {least}", found.distance);
-            prop_assert!(found.distance >= least - 0.15, "{} {least}", found.distance);
+            prop_assert!(found.distance <= minimum + 1e-12, "{} {minimum}", found.distance);
+            prop_assert!(found.distance >= minimum - 0.15, "{} {minimum}", found.distance);
         }
     }
 

@@ -118,8 +118,8 @@ fn cut(mesh: &Mesh, length: f64) -> Mesh {
         let longest = (0..3).max_by(|a, b| side(*a).total_cmp(&side(*b))).unwrap();
         if side(longest) > length {
             let [a, b, c] = [0, 1, 2].map(|k| t[(longest + k) % 3]);
-            let middle = (a + b) * 0.5;
-            open.extend([[a, middle, c], [middle, b, c]]);
+            let midpoint = (a + b) * 0.5;
+            open.extend([[a, midpoint, c], [midpoint, b, c]]);
             continue;
         }
         faces.push(t.map(|p| {

@@ -95,13 +95,13 @@ fn along_the_ray(scene: &DepthRegion, cloud: &PointCloud, camera_from_view: &Pos
     if off.len() < MIN_DIFFERENCES {
         return *camera_from_view;
     }
-    let middle = off.len() / 2;
-    let shift = *off.select_nth_unstable_by(middle, f64::total_cmp).1;
+    let half = off.len() / 2;
+    let shift = *off.select_nth_unstable_by(half, f64::total_cmp).1;
     camera_from_view.with_translation(centre + ray * shift)
 }
 
 /// The pose of a template's reference point for a match: the view rotated by `turn` in the region's frame.
 pub fn camera_from_view(camera_from_roi: &Pose, turn: f64) -> Pose {
-    let turned = sixfold_geometry::nalgebra::UnitQuaternion::from_axis_angle(&Vec3::z_axis(), turn);
-    *camera_from_roi * Pose::new(turned, Vec3::zeros())
+    let rotated = sixfold_geometry::nalgebra::UnitQuaternion::from_axis_angle(&Vec3::z_axis(), turn);
+    *camera_from_roi * Pose::new(rotated, Vec3::zeros())
 }

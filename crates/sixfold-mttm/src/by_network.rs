@@ -17,14 +17,14 @@ use crate::estimate::{
 use crate::estimator::MttmEstimator;
 use crate::learned::Learned;
 use crate::matching::Entry;
-use crate::model::{Encoded, MttmModel, PairSays};
+use crate::model::{Encoded, MttmModel, PairOutput};
 use crate::patch::Patch;
 use crate::published::{self, visible_centre};
 use crate::regions::RegionCache;
 use crate::roi::Roi;
 
 /// Regions compared with their templates as pairs: fewest and most. Chosen by hand; not swept.
-const LOOKED_AT: (usize, usize) = (64, 400);
+const COMPARED: (usize, usize) = (64, 400);
 /// Pairs that go through the network at a time; does not affect the result.
 const AT_A_TIME: usize = 32;
 /// Lower bound of the trust in a pair, so that the network cannot reject a pose whose surface agrees. Chosen by hand; not swept.
@@ -37,7 +37,7 @@ const ONE_IN: usize = 5;
 const LESS: usize = 30;
 /// Fraction (numerator, denominator) of the compared regions, the best matching ones, whose templates are aligned with the scene;
 /// chosen by hand, not swept.
-const LAID: (usize, usize) = (3, 4);
+const ALIGNED: (usize, usize) = (3, 4);
 /// Nearest templates examined per hypothesis of a region: most of them are neighbours of one another. Chosen by hand; not swept.
 const NEAREST: usize = 60;
 impl KnownObject {
@@ -100,29 +100,29 @@ pub(crate) fn first_matching(
     let nearest = learned.nearest(&regions.descriptors);
     let mut order: Vec<usize> = (0..rois.len()).collect();
     order.sort_by(|&a, &b| nearest[a].0.total_cmp(&nearest[b].0).then(a.cmp(&b)));
-    let looked_at = (rois.len() / ONE_IN).saturating_sub(LESS).clamp(LOOKED_AT.0, LOOKED_AT.1);
-    let chosen = apart(rois, order, APART * diameter, looked_at);
+    let compared = (rois.len() / ONE_IN).saturating_sub(LESS).clamp(COMPARED.0, COMPARED.1);
+    let chosen = apart(rois, order, APART * diameter, compared);
     let entries: Vec<Entry> = chosen.iter().map(|&i| object.matcher.entries()[nearest[i].1]).collect();
-    let says: Vec<Vec<PairSays>> = chosen
+    let output: Vec<Vec<PairOutput>> = chosen
         .par_chunks(AT_A_TIME)
         .zip(entries.par_chunks(AT_A_TIME))
         .map(|(chosen, entries)| {
             learned.model().compare(&regions.encoded(chosen), &learned.templates(entries))
         })
         .collect();
-    let says = says.concat();
+    let output = output.concat();
     let mut order: Vec<usize> = (0..chosen.len()).collect();
-    order.sort_by(|&a, &b| says[b].matching.total_cmp(&says[a].matching).then(a.cmp(&b)));
-    order.truncate(LAID.0 * looked_at / LAID.1);
+    order.sort_by(|&a, &b| output[b].matching.total_cmp(&output[a].matching).then(a.cmp(&b)));
+    order.truncate(ALIGNED.0 * compared / ALIGNED.1);
     let by_points = (options.matched_by == MatchedBy::Both).then(|| {
         // Regions centred on the predicted centre of the object.
         let centred: Vec<Roi> = order
             .iter()
             .map(|&k| {
                 let roi = &rois[chosen[k]];
-                let place = match says[k].offset {
+                let place = match output[k].offset {
                     Some(offset) => Vec3::from(offset) * size,
-                    None => visible_centre(scene, roi, size, &says[k].mask),
+                    None => visible_centre(scene, roi, size, &output[k].mask),
                 };
                 Roi { centre: roi.camera_from_roi().transform_point(&place) }
             })
@@ -135,13 +135,13 @@ pub(crate) fn first_matching(
         .par_iter()
         .enumerate()
         .map(|(n, &k)| {
-            let (says, entry) = (&says[k], &entries[k]);
-            let start = start(scene, object, learned, &rois[chosen[k]], entry, says, options);
-            let placed = place_at(scene, object, entry.template, start, trust(says), options);
+            let (output, entry) = (&output[k], &entries[k]);
+            let start = start(scene, object, learned, &rois[chosen[k]], entry, output, options);
+            let placed = place_at(scene, object, entry.template, start, trust(output), options);
             let Some((roi, found)) = by_points.as_ref().map(|all| &all[n]) else { return placed };
             let entry = object.matcher.entries()[found.entry];
             let start = camera_from_view(&roi.camera_from_roi(), entry.turn);
-            let other = place_at(scene, object, entry.template, start, trust(says), options);
+            let other = place_at(scene, object, entry.template, start, trust(output), options);
             if other.support > placed.support { other } else { placed }
         })
         .collect()
@@ -200,7 +200,7 @@ pub(crate) fn second_matching(
         })
         .collect::<Vec<_>>()
         .concat();
-    let says: Vec<Vec<PairSays>> = chosen
+    let output: Vec<Vec<PairOutput>> = chosen
         .par_chunks(AT_A_TIME)
         .map(|part| {
             let numbers: Vec<usize> = part.iter().map(|c| c.0).collect();
@@ -208,15 +208,15 @@ pub(crate) fn second_matching(
             model.compare(&regions.select(&numbers), &learned.templates(&entries))
         })
         .collect();
-    let says = says.concat();
+    let output = output.concat();
     let placed: Vec<Option<Placed>> = chosen
         .par_iter()
-        .zip(&says)
-        .map(|((region, entry), says)| {
-            let start = start(scene, object, learned, &rois[*region], entry, says, options);
+        .zip(&output)
+        .map(|((region, entry), output)| {
+            let start = start(scene, object, learned, &rois[*region], entry, output, options);
             // The seed's own template may get a better initial pose here.
             let known = is_known(object, &found[*region][1..], entry.template, &start);
-            (!known).then(|| place_at(scene, object, entry.template, start, trust(says), options))
+            (!known).then(|| place_at(scene, object, entry.template, start, trust(output), options))
         })
         .collect();
     for ((region, _), placed) in chosen.iter().zip(placed) {
@@ -238,20 +238,20 @@ fn start(
     learned: &Learned,
     roi: &Roi,
     entry: &Entry,
-    says: &PairSays,
+    output: &PairOutput,
     options: &MttmOptions,
 ) -> Pose {
     let camera_from_roi = roi.camera_from_roi();
     if !options.predicted_pose {
         return camera_from_view(&camera_from_roi, entry.turn);
     }
-    learned.camera_from_view(&camera_from_roi, entry.turn, says).unwrap_or_else(|| {
-        let centre = visible_centre(scene, roi, learned.size(), &says.mask);
+    learned.camera_from_view(&camera_from_roi, entry.turn, output).unwrap_or_else(|| {
+        let centre = visible_centre(scene, roi, learned.size(), &output.mask);
         let centre = camera_from_roi.transform_point(&centre);
-        published::start(object, &camera_from_roi, &centre, entry, says, options)
+        published::start(object, &camera_from_roi, &centre, entry, output, options)
     })
 }
 
-fn trust(says: &PairSays) -> f64 {
-    MIN_TRUST + (1.0 - MIN_TRUST) * f64::from(says.matching)
+fn trust(output: &PairOutput) -> f64 {
+    MIN_TRUST + (1.0 - MIN_TRUST) * f64::from(output.matching)
 }

@@ -49,7 +49,7 @@ pub enum TemplateError {
     /// Much of the mask does not show the object.
     #[error(
         "{:.0} % of the mask lies on the plane around it and {:.0} % beyond a depth edge, at most {:.0} % are left out: cut it closer to the object",
-        100.0 * on_plane, 100.0 * beyond_edges, 100.0 * most
+        100.0 * on_plane, 100.0 * beyond_edges, 100.0 * maximum
     )]
     MaskTooLarge {
         /// Fraction of its pixels with depth on the plane that surrounds it.
@@ -57,11 +57,12 @@ pub enum TemplateError {
         /// Fraction beyond a depth edge, on surfaces that continue outside the mask.
         beyond_edges: f64,
         /// Largest fraction that may be left out.
-        most: f64,
+        maximum: f64,
     },
     /// The object in the mask has a size that no tabletop object has.
     #[error(
-        "what the mask shows is {found:.3} m large, expected {low} m to {high} m: is the depth scale right, and does the mask hold one object only?"
+        "the surface in the mask is {found:.3} m large, expected {low} m to {high} m: is the depth scale \
+         right, and does the mask hold one object only?"
     )]
     Size {
         /// Largest extent in metres.
@@ -72,12 +73,12 @@ pub enum TemplateError {
         high: f64,
     },
     /// There are more views than a file can contain templates.
-    #[error("found {found} views, expected at most {most}: leave out views that look nearly the same")]
+    #[error("found {found} views, expected at most {maximum}: leave out views that look nearly the same")]
     TooManyViews {
         /// Views found.
         found: usize,
         /// Most views accepted.
-        most: usize,
+        maximum: usize,
     },
     /// No view was given.
     #[error("no view of the object was given")]

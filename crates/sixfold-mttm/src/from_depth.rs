@@ -5,7 +5,9 @@ use sixfold_geometry::{Camera, DepthImage, Mask, Pose, Vec2, Vec3};
 use crate::error::TemplateError;
 use crate::roi::ray_rotation;
 use crate::store::MAX_TEMPLATES;
-use crate::template::{ObjectTemplates, SIDE, Source, Template, TemplateOptions, middle_pixel, patch_camera};
+use crate::template::{
+    ObjectTemplates, SIDE, Source, Template, TemplateOptions, central_pixel, patch_camera,
+};
 
 /// Sizes of tabletop objects, metres: other sizes indicate a wrong depth scale or mask. Chosen by hand; not swept.
 const SIZES: (f64, f64) = (0.015, 0.6);
@@ -53,7 +55,7 @@ impl ObjectTemplates {
         options.check()?;
         let first = views.first().ok_or(TemplateError::NoViews)?;
         if views.len() > MAX_TEMPLATES {
-            return Err(TemplateError::TooManyViews { found: views.len(), most: MAX_TEMPLATES });
+            return Err(TemplateError::TooManyViews { found: views.len(), maximum: MAX_TEMPLATES });
         }
         let posed = first.camera_from_object.is_some();
         let mut extent = 0f64;
@@ -135,8 +137,8 @@ fn largest_extent(seen: &[Seen]) -> f64 {
 
 fn cut(view: &DepthView<'_>, seen: &[Seen], size: f64) -> Template {
     let pixels: Vec<[usize; 2]> = seen.iter().map(|s| s.0).collect();
-    let middle = middle_pixel(&pixels).unwrap_or_default();
-    let reference = seen.iter().find(|s| s.0 == middle).map_or(Vec3::z(), |s| s.1);
+    let central = central_pixel(&pixels).unwrap_or_default();
+    let reference = seen.iter().find(|s| s.0 == central).map_or(Vec3::z(), |s| s.1);
     let distance = reference.norm();
     let patch = patch_camera(size, distance);
     let camera_from_patch = ray_rotation(&reference);
@@ -158,10 +160,10 @@ fn cut(view: &DepthView<'_>, seen: &[Seen], size: f64) -> Template {
         })
         .collect();
     let view_from_camera = Pose::new(camera_from_patch.inverse(), -Vec3::z() * distance);
-    let middle = seen.iter().map(|s| s.1).sum::<Vec3>() / seen.len() as f64;
+    let centroid = seen.iter().map(|s| s.1).sum::<Vec3>() / seen.len() as f64;
     let view_from_object = match view.camera_from_object {
         Some(pose) => view_from_camera * pose,
-        None => view_from_camera * Pose::new(camera_from_patch, middle),
+        None => view_from_camera * Pose::new(camera_from_patch, centroid),
     };
     Template { view_from_object, distance, depth }
 }
@@ -208,7 +210,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_a_view_is_refused() {
+    fn invalid_views_are_refused() {
         let (depth, mask, _) = ball();
         let camera = camera();
         let view = DepthView { depth: &depth, camera: &camera, mask: &mask, camera_from_object: None };

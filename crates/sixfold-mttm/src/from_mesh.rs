@@ -10,7 +10,9 @@ use sixfold_mesh::{Mesh, simplify};
 use sixfold_render::{RenderOptions, SceneObject, VisibilityBuffer};
 
 use crate::error::{StoreError, TemplateError};
-use crate::template::{ObjectTemplates, SIDE, Source, Template, TemplateOptions, middle_pixel, patch_camera};
+use crate::template::{
+    ObjectTemplates, SIDE, Source, Template, TemplateOptions, central_pixel, patch_camera,
+};
 use crate::views::{view_directions, view_rotation};
 
 /// More faces than this are finer than a template's pixels; chosen by hand, not swept.
@@ -138,7 +140,7 @@ pub(crate) fn draw_rotated(
         let depth = frame.depth();
         let pixels: Vec<[usize; 2]> =
             (0..SIDE * SIDE).map(|i| [i % SIDE, i / SIDE]).filter(|&[x, y]| depth[(x, y)] > 0.0).collect();
-        let [x, y] = middle_pixel(&pixels)?;
+        let [x, y] = central_pixel(&pixels)?;
         let seen = camera.unproject(&Vec2::new(x as f64, y as f64), f64::from(depth[(x, y)]));
         pose = pose.with_translation(pose.translation() + Vec3::z() * distance - seen);
     }
@@ -169,7 +171,7 @@ mod tests {
     }
 
     #[test]
-    fn every_point_of_a_template_lies_on_the_mesh() {
+    fn every_point_of_a_template_is_on_the_mesh() {
         let templates = ObjectTemplates::from_mesh(&brick(), &TemplateOptions::default()).unwrap();
         assert_eq!(templates.templates.len(), 305);
         for t in templates.templates.iter().step_by(17) {

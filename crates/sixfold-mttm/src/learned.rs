@@ -11,7 +11,7 @@ use sixfold_io::fnv1a;
 use crate::descriptor_file;
 use crate::error::StoreError;
 use crate::matching::Entry;
-use crate::model::{Descriptor, Encoded, MttmModel, PairSays};
+use crate::model::{Descriptor, Encoded, MttmModel, PairOutput};
 use crate::network::DESCRIPTOR;
 use crate::patch::{Patch, REACH, TemplateSurface};
 use crate::regions::shared_diameter;
@@ -114,10 +114,10 @@ impl Learned {
 
     /// The pose that the network predicts for a template in the camera frame: rotation, and position of the reference point; `None`
     /// if the network was not trained to predict the position.
-    pub fn camera_from_view(&self, camera_from_roi: &Pose, turn: f64, says: &PairSays) -> Option<Pose> {
-        let turned = UnitQuaternion::from_axis_angle(&Vec3::z_axis(), turn);
-        let place = Vec3::from(says.offset?) * self.size;
-        Some(*camera_from_roi * Pose::new(says.rotation * turned, place))
+    pub fn camera_from_view(&self, camera_from_roi: &Pose, turn: f64, output: &PairOutput) -> Option<Pose> {
+        let rotated = UnitQuaternion::from_axis_angle(&Vec3::z_axis(), turn);
+        let place = Vec3::from(output.offset?) * self.size;
+        Some(*camera_from_roi * Pose::new(output.rotation * rotated, place))
     }
 }
 

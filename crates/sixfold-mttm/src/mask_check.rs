@@ -98,7 +98,7 @@ pub fn check_mask(depth: &DepthImage, camera: &Camera, mask: &Mask) -> Result<Ch
         return Err(TemplateError::MaskTooLarge {
             on_plane: checked.on_plane,
             beyond_edges: checked.beyond_edges,
-            most: MAX_LEFT_OUT,
+            maximum: MAX_LEFT_OUT,
         });
     }
     Ok(checked)
@@ -278,7 +278,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_large_mask_takes_in_is_left_out() {
+    fn surroundings_in_a_large_mask_are_left_out() {
         for bumpy in [false, true] {
             let (depth, mask) = scene(bumpy);
             let large = mask.grown(3);

@@ -118,7 +118,7 @@ impl Matcher {
                 let chosen = chosen_points(template, object.size);
                 turns
                     .iter()
-                    .map(|&turn| (Entry { template: number, turn }, turned(&chosen, turn)))
+                    .map(|&turn| (Entry { template: number, turn }, rotated(&chosen, turn)))
                     .filter(|(_, points)| points.len() >= POINTS / KEPT)
                     .collect()
             })
@@ -258,7 +258,7 @@ fn chosen_points(template: &Template, size: f64) -> Vec<Chosen> {
     chosen
 }
 
-fn turned(chosen: &[Chosen], turn: f64) -> Vec<Point> {
+fn rotated(chosen: &[Chosen], turn: f64) -> Vec<Point> {
     let (sin, cos) = turn.sin_cos();
     let scale = GRID as f64 / SIDE as f64;
     chosen
@@ -307,7 +307,7 @@ mod tests {
     /// The roof's cells rotated by an angle.
     fn cells(turn: f64) -> Vec<Cell> {
         let mut cells = vec![[0.2, 0.0, 0.0, -1.0]; GRID * GRID];
-        for p in turned(&all_points(), turn) {
+        for p in rotated(&all_points(), turn) {
             let n = p.normal;
             cells[p.cell as usize] = [p.depth, n[0], n[1], n[2]];
         }
@@ -336,7 +336,7 @@ mod tests {
     }
 
     #[test]
-    fn the_right_turn_matches_best() {
+    fn the_right_rotation_matches_best() {
         let object = roof();
         let matcher = Matcher::new(&object, &MatchOptions::default());
         assert_eq!(matcher.entries().len(), 7);
@@ -348,7 +348,7 @@ mod tests {
     }
 
     #[test]
-    fn hidden_cells_say_little_and_cells_seen_through_say_no() {
+    fn hidden_cells_count_little_and_cells_seen_through_contradict() {
         let object = roof();
         let matcher = Matcher::new(&object, &MatchOptions::default());
         let seen = cells(0.0);

@@ -47,7 +47,7 @@ pub type Descriptor = [f32; DESCRIPTOR];
 
 /// Predictions of the network for a region and a template.
 #[derive(Debug, Clone, PartialEq)]
-pub struct PairSays {
+pub struct PairOutput {
     /// Probability that each of 14 x 14 cells of the region belongs to the object, row by row.
     pub mask: Vec<f32>,
     /// Region from template.
@@ -207,7 +207,7 @@ impl MttmModel {
     }
 
     /// The network's predictions for pairs of a region and a template, row by row.
-    pub fn compare(&self, regions: &Encoded, templates: &Encoded) -> Vec<PairSays> {
+    pub fn compare(&self, regions: &Encoded, templates: &Encoded) -> Vec<PairOutput> {
         let compared = self.network.compare(regions.maps.clone(), templates.maps.clone());
         let masks = numbers(sigmoid(compared.mask));
         let rotations = numbers(compared.rotation);
@@ -218,7 +218,7 @@ impl MttmModel {
             .map(|i| {
                 let q: [f64; 4] = std::array::from_fn(|k| f64::from(rotations[4 * i + k]));
                 let quaternion = Quaternion::new(q[0], q[1], q[2], q[3]);
-                PairSays {
+                PairOutput {
                     mask: masks[i * MAP * MAP..(i + 1) * MAP * MAP].to_vec(),
                     rotation: UnitQuaternion::try_new(quaternion, 1e-3)
                         .unwrap_or_else(UnitQuaternion::identity),
@@ -281,7 +281,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_asked_together_is_answered_as_if_alone() {
+    fn a_batch_gives_the_same_as_single_queries() {
         let model = model();
         let patches: Vec<Patch> = (0..70).map(patch).collect();
         let encoded = model.encode(&patches.iter().collect::<Vec<_>>());
@@ -301,18 +301,18 @@ mod tests {
     }
 
     #[test]
-    fn what_was_not_taught_is_not_used() {
+    fn untrained_outputs_are_not_used() {
         let network = Network::Compact(CompactConfig.init(1, &Device::flex()));
-        let says = |training: serde_json::Value| {
+        let output = |training: serde_json::Value| {
             let extra = serde_json::json!({ "training": training });
             let model = MttmModel::new(network.clone(), ModelCard { extra, ..ModelCard::new("", "test") });
             let encoded = model.encode(&[&patch(1)]);
             model.compare(&encoded, &model.encode_templates(&[patch(2)])).remove(0)
         };
-        let all = says(serde_json::json!({ "offset": 4.0, "matching": 0.5 }));
+        let all = output(serde_json::json!({ "offset": 4.0, "matching": 0.5 }));
         assert!(all.offset.is_some() && all.matching < 1.0);
         let published =
-            says(serde_json::to_value(crate::training::MttmTrainingOptions::published()).unwrap());
+            output(serde_json::to_value(crate::training::MttmTrainingOptions::published()).unwrap());
         assert_eq!((published.offset, published.matching), (None, 1.0));
         assert_eq!((published.mask, published.rotation), (all.mask, all.rotation));
     }

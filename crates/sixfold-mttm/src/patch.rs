@@ -37,10 +37,10 @@ impl Patch {
         side: usize,
         seen: impl Fn(usize) -> bool,
     ) -> Patch {
-        Patch::of_cells(&roi.look(scene, size, side, seen), size, side)
+        Patch::of_cells(&roi.cells_on_grid(scene, size, side, seen), size, side)
     }
 
-    /// Cells of a region of `size` metres, as [`Roi::look`] returns them.
+    /// Cells of a region of `size` metres, as [`Roi::cells_on_grid`] returns them.
     pub fn of_cells(cells: &[Cell], size: f64, side: usize) -> Patch {
         let mut patch = Patch::empty(side);
         for (i, [depth, x, y, z]) in cells.iter().enumerate() {
@@ -89,9 +89,9 @@ impl TemplateSurface {
         let mut patch = Patch::empty(side);
         let (sin, cos) = turn.sin_cos();
         let scale = size / side as f64 / self.pixel_size;
-        let (middle, centre) = ((side as f64 - 1.0) / 2.0, (SIDE as f64 - 1.0) / 2.0);
+        let (own_centre, centre) = ((side as f64 - 1.0) / 2.0, (SIDE as f64 - 1.0) / 2.0);
         for i in 0..side * side {
-            let (u, v) = (((i % side) as f64 - middle) * scale, ((i / side) as f64 - middle) * scale);
+            let (u, v) = (((i % side) as f64 - own_centre) * scale, ((i / side) as f64 - own_centre) * scale);
             let (x, y) = ((cos * u + sin * v + centre).round(), (-sin * u + cos * v + centre).round());
             if !(x >= 0.0 && y >= 0.0 && x < SIDE as f64 && y < SIDE as f64) {
                 continue;
@@ -130,7 +130,7 @@ mod tests {
     }
 
     #[test]
-    fn a_template_looks_like_the_scene_it_is_seen_in() {
+    fn a_template_resembles_its_object_in_a_scene() {
         let mesh = wedge();
         let object = ObjectTemplates::from_mesh(&mesh, &TemplateOptions::default()).unwrap();
         let size = REACH * object.diameter;

@@ -72,14 +72,14 @@ mod tests {
 
     fn distance(mesh: &Mesh, turn: f64) -> f64 {
         let upright = crate::views::view_rotation(&Vec3::new(1.0, 0.0, 0.3));
-        let turned = upright * UnitQuaternion::from_axis_angle(&Vec3::z_axis(), turn);
+        let rotated = upright * UnitQuaternion::from_axis_angle(&Vec3::z_axis(), turn);
         let size = 1.2 * mesh.diameter();
-        let [a, b] = [upright, turned].map(|r| draw_rotated(mesh, r, size, 0.8).unwrap());
-        pose_distance((&upright, &a), (&turned, &b))
+        let [a, b] = [upright, rotated].map(|r| draw_rotated(mesh, r, size, 0.8).unwrap());
+        pose_distance((&upright, &a), (&rotated, &b))
     }
 
     #[test]
-    fn a_turn_that_cannot_be_seen_is_no_distance() {
+    fn an_invisible_rotation_is_no_distance() {
         let round = prism(48, |_| 0.04);
         assert_eq!(distance(&round, 1.0), 0.0);
         // A blade: from its narrow side it covers half as many pixels.

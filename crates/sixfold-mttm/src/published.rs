@@ -17,7 +17,7 @@ use crate::estimate::{KnownObject, MttmOptions, Placed, SAME_ROTATION, Stages, p
 use crate::learned::Learned;
 use crate::mask::{Pixels, common, template_mask};
 use crate::matching::Entry;
-use crate::model::{Encoded, PairSays};
+use crate::model::{Encoded, PairOutput};
 use crate::network::MAP;
 use crate::patch::Patch;
 use crate::regions::RegionCache;
@@ -57,7 +57,7 @@ pub(crate) fn hypotheses(
     order.truncate(SELECTED);
     // The first mask prediction, and one region of all masks that overlap: the seed has the nearest template.
     let entries: Vec<Entry> = order.iter().map(|&i| object.matcher.entries()[nearest[i].1]).collect();
-    let says: Vec<Vec<PairSays>> = order
+    let output: Vec<Vec<PairOutput>> = order
         .par_chunks(AT_A_TIME)
         .zip(entries.par_chunks(AT_A_TIME))
         .map(|(rois, entries)| learned.model().compare(&regions.encoded(rois), &learned.templates(entries)))
@@ -65,8 +65,10 @@ pub(crate) fn hypotheses(
     let size = learned.size();
     let masks: Vec<(Roi, Pixels)> = order
         .par_iter()
-        .zip(says.concat())
-        .map(|(&i, says)| (regions.rois[i], mask_pixels(scene, &regions.rois[i], size, &says.mask, STRIDE)))
+        .zip(output.concat())
+        .map(|(&i, output)| {
+            (regions.rois[i], mask_pixels(scene, &regions.rois[i], size, &output.mask, STRIDE))
+        })
         .collect();
     let kept = merged(masks, options.masked);
     stages.regions = kept.len();
@@ -108,8 +110,8 @@ fn region(
     let bare = model.without_background(&encoded, cells_of(scene, roi, size, first_mask));
     let Some(descriptor) = model.describe(&bare).into_iter().next() else { return vec![] };
     let camera_from_roi = roi.camera_from_roi();
-    let turned = |e: &Entry| crate::align::camera_from_view(&camera_from_roi, e.turn);
-    let pose = |e: &Entry| object.object_pose(&turned(e), e.template);
+    let rotated = |e: &Entry| crate::align::camera_from_view(&camera_from_roi, e.turn);
+    let pose = |e: &Entry| object.object_pose(&rotated(e), e.template);
     let mut entries: Vec<Entry> = vec![];
     for (_, number) in learned.ranked(&descriptor).into_iter().take(NEAREST * options.hypotheses) {
         if entries.len() == options.hypotheses {
@@ -124,14 +126,14 @@ fn region(
         return vec![];
     }
     let regions = Encoded::joined(&vec![encoded; entries.len()]);
-    let says = model.compare(&regions, &learned.templates(&entries));
+    let output = model.compare(&regions, &learned.templates(&entries));
     // One mask per region, predicted for its first hypothesis.
-    let mask = Arc::new(mask_pixels(scene, roi, size, &says[0].mask, 1));
+    let mask = Arc::new(mask_pixels(scene, roi, size, &output[0].mask, 1));
     let Some(centre) = centroid(scene, &mask) else { return vec![] };
     let starts: Vec<Pose> = entries
         .iter()
-        .zip(&says)
-        .map(|(entry, says)| start(object, &camera_from_roi, &centre, entry, says, options))
+        .zip(&output)
+        .map(|(entry, output)| start(object, &camera_from_roi, &centre, entry, output, options))
         .collect();
     if !covers(scene, object, &entries[0], &starts[0], &mask) {
         return vec![];
@@ -152,16 +154,16 @@ pub(crate) fn start(
     camera_from_roi: &Pose,
     centre: &Vec3,
     entry: &Entry,
-    says: &PairSays,
+    output: &PairOutput,
     options: &MttmOptions,
 ) -> Pose {
-    let turned = crate::align::camera_from_view(camera_from_roi, entry.turn);
+    let rotated = crate::align::camera_from_view(camera_from_roi, entry.turn);
     let rotation = if options.predicted_pose {
         camera_from_roi.rotation()
-            * says.rotation
-            * (camera_from_roi.rotation().inverse() * turned.rotation())
+            * output.rotation
+            * (camera_from_roi.rotation().inverse() * rotated.rotation())
     } else {
-        turned.rotation()
+        rotated.rotation()
     };
     let of_template = object.surfaces[entry.template].dense.centroid().unwrap_or_else(Vec3::zeros);
     Pose::new(rotation, centre - rotation * of_template)
@@ -224,7 +226,7 @@ fn cells_of(scene: &DepthRegion, roi: &Roi, size: f64, mask: &Pixels) -> Vec<f32
         let (x, y) = (pixel % width / STRIDE * STRIDE, pixel / width / STRIDE * STRIDE);
         mask.binary_search(&((y * width + x) as u32)).is_ok()
     };
-    let cells = roi.look(scene, size, MAP, inside);
+    let cells = roi.cells_on_grid(scene, size, MAP, inside);
     cells.iter().map(|c| f32::from(u8::from(*c != UNKNOWN))).collect()
 }
 
@@ -289,7 +291,7 @@ mod tests {
     }
 
     #[test]
-    fn the_centroid_lies_on_what_most_of_the_mask_shows() {
+    fn the_centroid_is_on_the_surface_of_most_of_the_mask() {
         let scene = scene();
         let mask: Vec<f32> = (0..MAP * MAP)
             .map(|i| f32::from(u8::from((3..11).contains(&(i % MAP)) && (3..11).contains(&(i / MAP)))))

@@ -83,7 +83,7 @@ pub struct MttmRecipe {
     pub steps: Option<u64>,
     /// Regions with an object in a step.
     pub anchors: Option<usize>,
-    /// Highest learning rate.
+    /// Maximum learning rate.
     pub learning_rate: Option<f64>,
     /// Synthetic objects: half of them household shapes, half of them toys.
     pub objects: usize,

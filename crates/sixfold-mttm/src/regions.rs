@@ -112,7 +112,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn sizes_that_share_are_near_one_another() {
+    fn shared_sizes_are_near_one_another() {
         for diameter in [0.03, 0.102, 0.145, 0.155, 0.201, 0.261, 0.4] {
             let shared = shared_diameter(diameter);
             assert!((0.89..1.12).contains(&(shared / diameter)), "{diameter} {shared}");
@@ -121,7 +121,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_far_behind_the_centre_does_not_count() {
+    fn points_far_behind_the_centre_do_not_count() {
         let mut patch = Patch::empty(28);
         for i in 0..100 {
             patch.values[4 * 784 + i] = 1.0;

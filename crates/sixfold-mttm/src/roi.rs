@@ -39,11 +39,11 @@ impl Roi {
     /// The cells, row by row. `size` is the region's side in metres; pixels (by their number in the image) for which `seen` is
     /// false are unknown.
     pub fn cells(&self, scene: &DepthRegion, size: f64, seen: impl Fn(usize) -> bool) -> Vec<Cell> {
-        self.look(scene, size, GRID, seen)
+        self.cells_on_grid(scene, size, GRID, seen)
     }
 
     /// The same on a grid of `grid x grid` cells.
-    pub fn look(
+    pub fn cells_on_grid(
         &self,
         scene: &DepthRegion,
         size: f64,
@@ -223,22 +223,22 @@ mod tests {
     }
 
     #[test]
-    fn a_region_sees_its_surroundings_relative_to_its_centre() {
+    fn a_region_describes_its_surroundings_relative_to_its_centre() {
         let scene = scene();
         let centre = scene.camera().unproject(&Vec2::new(150.0, 340.0), 0.6);
         let cells = Roi { centre }.cells(&scene, 0.06, |_| true);
         let at = |column: usize, row: usize| cells[row * GRID + column];
-        let middle = at(GRID / 2, GRID / 2);
-        assert!(middle[0].abs() < 0.003, "{middle:?}");
+        let central = at(GRID / 2, GRID / 2);
+        assert!(central[0].abs() < 0.003, "{central:?}");
         // The box faces the camera's axis; the region's axis is a ray 20 degrees from it.
         let axis = centre.normalize();
-        assert!((f64::from(middle[3]) + axis.z).abs() < 0.01, "{middle:?}");
+        assert!((f64::from(central[3]) + axis.z).abs() < 0.01, "{central:?}");
         let nothing = Roi { centre }.cells(&scene, 0.06, |_| false);
         assert!(nothing.iter().all(|c| *c == UNKNOWN));
     }
 
     #[test]
-    fn a_turn_to_a_ray_is_as_small_as_can_be() {
+    fn a_rotation_to_a_ray_is_minimal() {
         for p in [Vec3::z(), Vec3::new(0.3, -0.2, 0.9), Vec3::new(-0.5, 0.0, 0.5)] {
             let r = ray_rotation(&p);
             assert!((r * Vec3::z() - p.normalize()).norm() < 1e-12);

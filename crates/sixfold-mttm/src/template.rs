@@ -166,7 +166,7 @@ pub(crate) fn patch_camera(size: f64, distance: f64) -> Camera {
 }
 
 /// The pixel of a mask nearest to its centroid.
-pub(crate) fn middle_pixel(pixels: &[[usize; 2]]) -> Option<[usize; 2]> {
+pub(crate) fn central_pixel(pixels: &[[usize; 2]]) -> Option<[usize; 2]> {
     let n = pixels.len() as f64;
     let mean = |k: usize| pixels.iter().map(|p| p[k] as f64).sum::<f64>() / n;
     let (x, y) = (mean(0), mean(1));

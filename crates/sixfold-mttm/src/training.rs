@@ -295,7 +295,7 @@ mod tests {
     }
 
     #[test]
-    fn it_goes_on_where_it_stopped() {
+    fn it_resumes_from_its_last_checkpoint() {
         let pool = pool();
         assert!(pool.with_object().len() >= 12, "{}", pool.with_object().len());
         assert!(!pool.without_object().is_empty());

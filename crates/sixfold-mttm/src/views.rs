@@ -63,16 +63,16 @@ pub fn view_directions(coverage: ViewCoverage) -> Vec<Vec3> {
         }
     }
     for _ in 0..3 {
-        let mut middles: BTreeMap<(usize, usize), usize> = BTreeMap::new();
+        let mut midpoints: BTreeMap<(usize, usize), usize> = BTreeMap::new();
         let mut finer = Vec::with_capacity(4 * faces.len());
         for [a, b, c] in faces {
-            let mut middle = |i: usize, j: usize| {
-                *middles.entry((i.min(j), i.max(j))).or_insert_with(|| {
+            let mut midpoint = |i: usize, j: usize| {
+                *midpoints.entry((i.min(j), i.max(j))).or_insert_with(|| {
                     corners.push((corners[i] + corners[j]).normalize());
                     corners.len() - 1
                 })
             };
-            let (ab, bc, ca) = (middle(a, b), middle(b, c), middle(c, a));
+            let (ab, bc, ca) = (midpoint(a, b), midpoint(b, c), midpoint(c, a));
             finer.extend([[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]]);
         }
         faces = finer;
@@ -112,7 +112,7 @@ mod tests {
     }
 
     #[test]
-    fn the_object_stands_upright_in_the_view() {
+    fn the_object_is_upright_in_the_view() {
         for d in view_directions(ViewCoverage::Around) {
             let r = view_rotation(&d);
             // The camera is in the given direction, on the view's negative z axis.

@@ -51,7 +51,7 @@ fn on_table(x: f64, y: f64, yaw: f64) -> Pose {
 }
 
 /// Depth of objects on the table, as a sensor with shadow and noise sees it, and the visible part of the first.
-fn look(objects: &[(&Mesh, Pose)], seed: u64) -> (DepthImage, Mask) {
+fn render_scene(objects: &[(&Mesh, Pose)], seed: u64) -> (DepthImage, Mask) {
     let table = cuboid([-0.7, -0.7, -0.02], [0.7, 0.7, 0.0]);
     let objects: Vec<SceneObject<'_>> = objects
         .iter()
@@ -105,7 +105,7 @@ fn found_from_all_sides_with_its_mask() {
     for (i, (x, y, yaw)) in [(0.0, 0.0, 0.3), (0.15, 0.1, 2.0), (-0.18, -0.08, -2.4)].into_iter().enumerate()
     {
         let truth = on_table(x, y, yaw);
-        let (depth, visible) = look(&[(&part(), truth)], i as u64);
+        let (depth, visible) = render_scene(&[(&part(), truth)], i as u64);
         let scene = prepared(&depth);
         let all = [
             (&alone[0], 6.0, 5.0),
@@ -127,14 +127,14 @@ fn found_from_all_sides_with_its_mask() {
 
 /// No alignment repairs a match here: its turn in the image has to be the scene's, not the opposite one.
 #[test]
-fn the_best_match_has_the_turn_of_the_image() {
+fn the_best_match_has_the_rotation_of_the_image() {
     let mesh = part();
     let templates = ObjectTemplates::from_mesh(&mesh, &TemplateOptions::default()).unwrap();
     let matcher = Matcher::new(&templates, &MatchOptions::default());
     for (number, turn) in [(40, 0.6), (150, -0.6), (220, 0.35)] {
-        let turned = UnitQuaternion::from_axis_angle(&Vec3::z_axis(), turn);
+        let rotated = UnitQuaternion::from_axis_angle(&Vec3::z_axis(), turn);
         let roi = Roi { centre: Vec3::new(0.0, 0.0, 0.8) };
-        let truth = Pose::new(turned, roi.centre) * templates.templates[number].view_from_object;
+        let truth = Pose::new(rotated, roi.centre) * templates.templates[number].view_from_object;
         let mut frame = VisibilityBuffer::new(&camera());
         frame.render(&[SceneObject { mesh: &mesh, camera_from_object: truth }], &RenderOptions::default());
         let cells = roi.cells(&prepared(&frame.depth()), templates.size, |_| true);
@@ -148,7 +148,7 @@ fn the_best_match_has_the_turn_of_the_image() {
 
 /// Before any alignment: the network's word on a region beside the object's centre, paired with the nearest of its templates.
 #[test]
-fn the_network_says_where_and_how_an_object_lies_and_which_pairs_match() {
+fn the_network_predicts_offset_rotation_and_matching() {
     let mesh = part();
     let object = ObjectTemplates::from_mesh(&mesh, &TemplateOptions::default()).unwrap();
     let entries = Matcher::new(&object, &MatchOptions::default()).entries().to_vec();
@@ -158,7 +158,7 @@ fn the_network_says_where_and_how_an_object_lies_and_which_pairs_match() {
     for k in 0..36 {
         let angle = f64::from(k) * 0.9;
         let truth = on_table(0.1 * angle.cos(), 0.05 * angle.sin(), 2.3 * angle);
-        let (depth, visible) = look(&[(&mesh, truth)], k as u64);
+        let (depth, visible) = render_scene(&[(&mesh, truth)], k as u64);
         let scene = prepared(&depth);
         let centre = truth.transform_point(&object.templates[0].view_from_object.inverse().translation());
         let beside = Vec3::new(angle.sin(), angle.cos(), 0.3).normalize() * (0.12 * object.diameter);
@@ -173,17 +173,17 @@ fn the_network_says_where_and_how_an_object_lies_and_which_pairs_match() {
         let region = model.encode(&[&Patch::of_scene(&scene, &roi, learned.size(), model.side(), |_| true)]);
         // About 20 degrees off, as the templates of the training are at most.
         let (right, wrong) = (entries[order[45]], entries[*order.last().unwrap()]);
-        let says = model.compare(&region.select(&[0, 0]), &learned.templates(&[right, wrong]));
-        let pose = learned.camera_from_view(&camera_from_roi, right.turn, &says[0]).unwrap()
+        let output = model.compare(&region.select(&[0, 0]), &learned.templates(&[right, wrong]));
+        let pose = learned.camera_from_view(&camera_from_roi, right.turn, &output[0]).unwrap()
             * object.templates[right.template].view_from_object;
-        let middle = pose.transform_point(&truth.inverse().transform_point(&centre));
-        places.push((middle - centre).norm() / beside.norm());
+        let found_centre = pose.transform_point(&truth.inverse().transform_point(&centre));
+        places.push((found_centre - centre).norm() / beside.norm());
         turns.push(pose.rotation_angle_to(&truth) / angle_of(&right));
-        sure.push(says[0].matching - says[1].matching);
+        sure.push(output[0].matching - output[1].matching);
         // Cells of the region that look at the object, and those that the mask head takes for it.
-        let cells = roi.look(&scene, learned.size(), MAP, |p| visible.as_slice()[p]);
+        let cells = roi.cells_on_grid(&scene, learned.size(), MAP, |p| visible.as_slice()[p]);
         let pairs: Vec<(bool, bool)> =
-            cells.iter().zip(&says[0].mask).map(|(c, m)| (*c != UNKNOWN, *m > 0.5)).collect();
+            cells.iter().zip(&output[0].mask).map(|(c, m)| (*c != UNKNOWN, *m > 0.5)).collect();
         let count = |of: fn(&(bool, bool)) -> bool| pairs.iter().filter(|p| of(p)).count() as f64;
         masks.push(count(|p| p.0 && p.1) / count(|p| p.0 || p.1));
     }
@@ -213,7 +213,7 @@ fn as_published_masks_come_first_and_poses_from_them() {
         [(0.0, 0.0, 0.3), (0.15, 0.1, 2.0), (-0.18, -0.08, -2.4), (0.05, -0.1, 1.2)].into_iter().enumerate()
     {
         let truth = on_table(x, y, yaw);
-        let (depth, visible) = look(&[(&part(), truth)], i as u64);
+        let (depth, visible) = render_scene(&[(&part(), truth)], i as u64);
         let scene = prepared(&depth);
         let (found, stages) = estimate(&scene, &object, &options);
         assert!(stages.sampled > 20 && stages.regions > 0, "{stages:?}");
@@ -258,7 +258,7 @@ fn a_template_that_reaches_into_the_table_is_no_match() {
         let surface = Surface::new(template, object.size, 160);
         judge(&scene, &surface, &(*pose * template.view_from_object.inverse()), 0.01, options)
     };
-    let empty = look(&[], 1).0;
+    let empty = render_scene(&[], 1).0;
     let (ours, printed) = (
         best(&empty, &sunk, &options),
         best(&empty, &sunk, &VerificationOptions { occluders_have_edges: false, ..options }),
@@ -268,7 +268,7 @@ fn a_template_that_reaches_into_the_table_is_no_match() {
     assert!(ours.depth < 0.85 * printed.depth, "{ours:?} {printed:?}");
     let stands = on_table(0.0, 0.0, 0.0);
     let board = cuboid([0.0, -0.2, 0.15], [0.2, 0.2, 0.16]);
-    let hidden = best(&look(&[(&block, stands), (&board, stands)], 1).0, &stands, &options);
+    let hidden = best(&render_scene(&[(&block, stands), (&board, stands)], 1).0, &stands, &options);
     assert!(hidden.occluded > 50 && hidden.pierced * 10 < hidden.occluded, "{hidden:?}");
 }
 
@@ -280,8 +280,8 @@ fn a_hidden_half_does_not_shift_the_pose() {
     let screen = cuboid([-0.05, -0.01, 0.0], [0.05, 0.01, 0.2]);
     // Nearer to the camera and to the right of the object's centre.
     let before = on_table(0.06, -0.085, 0.0);
-    let (depth, visible) = look(&[(&part(), truth), (&screen, before)], 5);
-    let (_, whole) = look(&[(&part(), truth)], 5);
+    let (depth, visible) = render_scene(&[(&part(), truth), (&screen, before)], 5);
+    let (_, whole) = render_scene(&[(&part(), truth)], 5);
     let count = |m: &Mask| m.as_slice().iter().filter(|v| **v).count() as f64;
     let share = count(&visible) / count(&whole);
     assert!((0.3..0.8).contains(&share), "the screen hides {share}");
@@ -298,18 +298,18 @@ fn a_hidden_half_does_not_shift_the_pose() {
 }
 
 #[test]
-fn what_is_not_there_is_not_surely_found() {
+fn absent_objects_are_not_found_with_high_confidence() {
     let box_alone = cuboid([-0.1, -0.07, 0.0], [0.1, 0.07, 0.09]);
     let sure = |found: &[MttmEstimate]| found.first().map_or(0.0, |e| e.confidence);
     for object in both_ways(known(true)) {
-        let (depth, _) = look(&[(&box_alone, on_table(0.0, 0.0, 0.5))], 3);
+        let (depth, _) = render_scene(&[(&box_alone, on_table(0.0, 0.0, 0.5))], 3);
         let (wrong, _) = estimate(&prepared(&depth), &object, &MttmOptions::default());
         let truth = on_table(0.1, 0.0, 1.0);
-        let (depth, _) = look(&[(&part(), truth)], 3);
+        let (depth, _) = render_scene(&[(&part(), truth)], 3);
         let (right, _) = estimate(&prepared(&depth), &object, &MttmOptions::default());
         assert!(sure(&right) > sure(&wrong) + 0.15, "{} {}", sure(&right), sure(&wrong));
         // An empty table: nothing at all.
-        let (depth, _) = look(&[], 3);
+        let (depth, _) = render_scene(&[], 3);
         let (nothing, stages) = estimate(&prepared(&depth), &object.without_mesh(), &MttmOptions::default());
         assert!(nothing.is_empty() || sure(&nothing) < 0.3, "{}", sure(&nothing));
         assert!(stages.sampled < 400, "{}", stages.sampled);
@@ -319,13 +319,13 @@ fn what_is_not_there_is_not_surely_found() {
 #[test]
 fn one_masked_view_is_enough_to_find_it_elsewhere() {
     let first = on_table(-0.1, 0.05, 0.4);
-    let (depth, mask) = look(&[(&part(), first)], 8);
+    let (depth, mask) = render_scene(&[(&part(), first)], 8);
     let camera = camera();
     let view = DepthView { depth: &depth, camera: &camera, mask: &mask, camera_from_object: Some(first) };
     let templates = ObjectTemplates::from_depth(&[view], &TemplateOptions::default()).unwrap();
     let truth = on_table(0.12, -0.06, 0.6);
     let other = cuboid([-0.04, -0.04, 0.0], [0.04, 0.04, 0.12]);
-    let (depth, visible) = look(&[(&part(), truth), (&other, on_table(-0.12, 0.0, 0.2))], 9);
+    let (depth, visible) = render_scene(&[(&part(), truth), (&other, on_table(-0.12, 0.0, 0.2))], 9);
     for object in both_ways(KnownObject::new(templates, None)) {
         let (found, _) = estimate(&prepared(&depth), &object, &MttmOptions::default());
         let best = found.first().expect("found");
@@ -340,7 +340,7 @@ fn a_large_mask_gives_the_size_of_the_right_one() {
     // A box behind the part, so that a large mask takes in more than the table.
     let (part, other) = (part(), cuboid([-0.05, -0.05, 0.0], [0.05, 0.05, 0.2]));
     let objects = [(&part, on_table(-0.1, 0.05, 0.4)), (&other, on_table(-0.08, 0.2, 0.1))];
-    let (depth, mask) = look(&objects, 8);
+    let (depth, mask) = render_scene(&objects, 8);
     let camera = camera();
     let size = |depth: &DepthImage, mask: &Mask| {
         let view = DepthView { depth, camera: &camera, mask, camera_from_object: None };
@@ -370,7 +370,7 @@ fn a_large_mask_gives_the_size_of_the_right_one() {
 
 #[test]
 fn same_result_at_any_number_of_threads() {
-    let (depth, _) = look(&[(&part(), on_table(0.02, 0.03, 1.1))], 2);
+    let (depth, _) = render_scene(&[(&part(), on_table(0.02, 0.03, 1.1))], 2);
     let scene = prepared(&depth);
     for object in both_ways(known(true)) {
         let with = |threads: usize| {
@@ -390,7 +390,7 @@ fn same_result_at_any_number_of_threads() {
 #[test]
 fn two_of_a_kind_are_two() {
     let poses = [on_table(-0.12, 0.0, 0.4), on_table(0.13, 0.02, 2.2)];
-    let (depth, _) = look(&[(&part(), poses[0]), (&part(), poses[1])], 6);
+    let (depth, _) = render_scene(&[(&part(), poses[0]), (&part(), poses[1])], 6);
     let options = MttmOptions { max_instances: 2, ..MttmOptions::default() };
     for object in both_ways(known(true)) {
         let (mut found, _) = estimate(&prepared(&depth), &object, &options);

@@ -68,8 +68,8 @@ pub enum CheckpointError {
         reasons: Vec<String>,
     },
     /// The checkpoint was written before checkpoints named their inputs.
-    #[error("{}: does not say from which inputs it was trained (an earlier version of Sixfold wrote it), so whether they are these \
-        is not known; train again in another folder", file.display())]
+    #[error("{}: does not say from which inputs it was trained (an earlier version of Sixfold wrote it), \
+         so it cannot be checked that they are the same; train again in another folder", file.display())]
     NoFingerprint {
         /// The file.
         file: PathBuf,

@@ -71,7 +71,7 @@ mod tests {
     use burn::tensor::TensorData;
 
     #[test]
-    fn its_gradient_leads_to_what_it_takes_for_true() {
+    fn its_gradient_agrees_with_finite_differences() {
         let device = Device::flex().autodiff();
         let critic = Critic::new("critic", 3, &device);
         let mut random = ChaCha8Rng::seed_from_u64(7);

@@ -52,21 +52,21 @@ impl OptionError {
     /// [`OptionError`].
     pub fn unless_steps(value: u64) -> Result<(), OptionError> {
         OptionError::unless(value > 0, "steps", value, "1 or more")?;
-        OptionError::unless(value <= MOST_STEPS, "steps", value, "at most 100000000")
+        OptionError::unless(value <= MAX_STEPS, "steps", value, "at most 100000000")
     }
 
-    /// Returns this error unless the number of samples per step is at least `least` and not more than fit into memory.
+    /// Returns this error unless the number of samples per step is at least `minimum` and not more than fit into memory.
     ///
     /// # Errors
     /// [`OptionError`].
     pub fn unless_samples(
         field: &'static str,
         value: usize,
-        least: usize,
+        minimum: usize,
         expected: &'static str,
     ) -> Result<(), OptionError> {
-        OptionError::unless(value >= least, field, value, expected)?;
-        OptionError::unless(value <= MOST_SAMPLES, field, value, "at most 1024")
+        OptionError::unless(value >= minimum, field, value, expected)?;
+        OptionError::unless(value <= MAX_SAMPLES, field, value, "at most 1024")
     }
 
     /// Returns this error unless `value` is a valid number of frozen stages of the five-stage ImageNet encoder.
@@ -82,19 +82,19 @@ impl OptionError {
     /// # Errors
     /// [`OptionError`].
     pub fn unless_weight(field: &'static str, value: f64) -> Result<(), OptionError> {
-        let fits = (0.0..=MOST_WEIGHT).contains(&value);
+        let fits = (0.0..=MAX_WEIGHT).contains(&value);
         OptionError::unless(fits, field, value, "a number from 0 to 1000000")
     }
 }
 
 /// Largest learning rate: with larger ones the first step gives NaN, after all samples were generated.
-const MOST_RATE: f64 = 1000.0;
+const MAX_RATE: f64 = 1000.0;
 /// Largest weight of a part of a loss.
-const MOST_WEIGHT: f64 = 1e6;
+const MAX_WEIGHT: f64 = 1e6;
 /// Largest number of steps of a training.
-const MOST_STEPS: u64 = 100_000_000;
+const MAX_STEPS: u64 = 100_000_000;
 /// Largest number of samples per step: they are in memory at the same time.
-const MOST_SAMPLES: usize = 1024;
+const MAX_SAMPLES: usize = 1024;
 
 /// Length, learning rate and regularisation of a training: AdamW (Loshchilov and Hutter 2019) with a cosine schedule. All fields
 /// affect the result. Methods flatten them into their own options.
@@ -102,7 +102,7 @@ const MOST_SAMPLES: usize = 1024;
 pub struct TrainingOptions {
     /// Optimiser steps, 1 or more.
     pub steps: u64,
-    /// Highest learning rate, above 0; it falls to zero as a cosine.
+    /// Maximum learning rate, above 0; it falls to zero as a cosine.
     pub learning_rate: f64,
     /// Initial steps over which the rate rises linearly. In a shorter training it rises until the last step.
     pub warm_up: u64,
@@ -124,7 +124,7 @@ impl TrainingOptions {
         OptionError::unless_steps(self.steps)?;
         let positive = |value: f64| value.is_finite() && value > 0.0;
         let above = "a finite number above 0";
-        let fits = positive(self.learning_rate) && self.learning_rate <= MOST_RATE;
+        let fits = positive(self.learning_rate) && self.learning_rate <= MAX_RATE;
         let expected = "a number above 0, at most 1000";
         OptionError::unless(fits, "learning_rate", self.learning_rate, expected)?;
         OptionError::unless_weight("weight_decay", f64::from(self.weight_decay))?;

@@ -446,7 +446,7 @@ mod tests {
     }
 
     #[test]
-    fn tensors_arrive_where_they_belong() {
+    fn tensors_are_loaded_into_their_modules() {
         let dir = tempfile::tempdir().unwrap();
         for prefix in ["", "module.", "state_dict.module."] {
             let mut all = tensors();

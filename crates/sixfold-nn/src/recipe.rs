@@ -442,7 +442,7 @@ mod tests {
     }
 
     #[test]
-    fn without_steps_what_there_is_is_measured_and_wrong_options_come_first() {
+    fn without_steps_the_weights_are_measured_and_wrong_options_come_first() {
         let folder = tempfile::tempdir().unwrap();
         let (stop, mut events) = (AtomicBool::new(false), |_: TrainingEvent<'_>| ());
         let mut session = Session::new(folder.path(), &stop, &mut events);

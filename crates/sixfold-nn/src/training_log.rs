@@ -73,7 +73,7 @@ pub enum TrainingLogError {
         reason: String,
     },
     /// The figure could not be drawn.
-    #[error("{}: expected records with losses to draw, found none; train a few steps first", file.display())]
+    #[error("{}: expected records with losses to plot, found none; train a few steps first", file.display())]
     NothingToDraw {
         /// The figure's file.
         file: PathBuf,
@@ -366,7 +366,7 @@ mod tests {
     }
 
     #[test]
-    fn curves_are_drawn_where_the_values_are() {
+    fn curves_are_plotted_at_their_values() {
         let dir = tempfile::tempdir().unwrap();
         let png = dir.path().join("curves.png");
         let mut log: Vec<_> = (1..=3000).map(record).collect();
@@ -383,9 +383,9 @@ mod tests {
         let rows: Vec<u32> = (TOP as u32..PANEL_HEIGHT - BOTTOM as u32)
             .filter(|y| picture.get_pixel(x, *y).0 == COLORS[0])
             .collect();
-        let middle = rows.iter().sum::<u32>() as f64 / rows.len() as f64;
+        let centre = rows.iter().sum::<u32>() as f64 / rows.len() as f64;
         let expected = TOP + 0.75 * (f64::from(PANEL_HEIGHT) - TOP - BOTTOM);
-        assert!((middle - expected).abs() < 2.0, "line at {middle}, expected {expected}");
+        assert!((centre - expected).abs() < 2.0, "line at {centre}, expected {expected}");
         assert!(draw_curves(&[], &png).unwrap_err().to_string().contains("train a few steps first"));
     }
 }

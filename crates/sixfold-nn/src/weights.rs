@@ -196,8 +196,8 @@ pub enum WeightsError {
         found: String,
     },
     /// A tensor contains an infinite number or NaN.
-    #[error("{}: tensor {tensor}: expected finite numbers, found {found}; the training went astray: \
-        go back to an earlier checkpoint or lower the learning rate", file.display())]
+    #[error("{}: tensor {tensor}: expected finite numbers, found {found}; the training diverged: go back \
+         to an earlier checkpoint or lower the learning rate", file.display())]
     NotFinite {
         /// The file.
         file: PathBuf,
@@ -621,7 +621,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_saved_is_loaded() {
+    fn saved_weights_are_loaded() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("net.safetensors");
         let device = Device::default();
@@ -646,7 +646,7 @@ mod tests {
     }
 
     #[test]
-    fn a_training_that_goes_on_has_seen_the_frames_of_the_one_before() {
+    fn a_continued_training_records_the_frames_of_the_previous_one() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("net.safetensors");
         let device = Device::default();
@@ -757,7 +757,7 @@ mod tests {
     }
 
     #[test]
-    fn the_card_for_people_holds_what_the_card_holds() {
+    fn the_readable_card_holds_all_fields() {
         let text = card_markdown(&card());
         for part in [
             "# A network | for tests",

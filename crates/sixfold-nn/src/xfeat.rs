@@ -281,7 +281,7 @@ mod tests {
     /// `checks/backbones_vs_pytorch.py` compares all numbers in full precision to 1e-4; the shipped weights are rounded to half
     /// precision.
     #[test]
-    fn the_shipped_weights_see_what_pytorch_sees() {
+    fn the_built_in_weights_agree_with_pytorch() {
         let device = Device::default();
         let network = XFeat::shipped(&device).unwrap();
         let (height, width) = (64, 96);

@@ -7,7 +7,7 @@ use rayon::prelude::*;
 use sixfold_mesh::Mesh;
 
 use crate::maps::Maps;
-use crate::refine::{Common, Light, Shown, look};
+use crate::refine::{Common, Light, PointSamples, sample_points};
 use crate::source::SourceView;
 use crate::surface::outwards;
 
@@ -25,13 +25,13 @@ const MIN_OPINION: f32 = 1.2;
 pub fn leave_out_what_differs(sources: &mut [SourceView], mesh: &Mesh) -> Vec<f64> {
     let surface = mesh.sample_surface(POINTS, 1);
     let normals = outwards(mesh, &surface.normals);
-    let raw: Vec<Shown> = sources
+    let raw: Vec<PointSamples> = sources
         .par_iter()
         .map(|source| {
             let maps = Maps::of_patch(&source.patch, BLUR);
             let allowed: Vec<f32> =
                 source.visible.data.iter().map(|v| f32::from(u8::from(*v > 0.5))).collect();
-            look(source, &maps, &allowed, &surface.points, &normals)
+            sample_points(source, &maps, &allowed, &surface.points, &normals)
         })
         .collect();
     let mut lit = raw.clone();
@@ -99,14 +99,14 @@ mod tests {
     use crate::refine::tests::photographs;
 
     #[test]
-    fn what_stands_before_the_object_in_one_photograph_is_left_out() {
+    fn occluders_in_one_photograph_are_left_out() {
         let (mesh, truth, list) = photographs(40, [0.0, 0.0], 5);
         // A bright occluder hides half of the block in the first one.
         let side = 96;
-        let middle = list[0].camera().project(&truth[0].translation()).unwrap().x;
+        let centre = list[0].camera().project(&truth[0].translation()).unwrap().x;
         let mut image = (**list[0].image()).clone();
         for (x, y) in (0..240).flat_map(|y| (0..320).map(move |x| (x, y))) {
-            if (x as f64) < middle {
+            if (x as f64) < centre {
                 image[(x, y)] = [250, 250, 20];
             }
         }

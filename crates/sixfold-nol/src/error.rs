@@ -10,7 +10,8 @@ pub enum NolError {
     Image(#[from] PosedImageError),
     /// The mask is empty, or does not show the object.
     #[error(
-        "photograph {name}: the mask covers {share:.0} % of the object's outline at the given pose, expected at least {least:.0} %; check that the mask belongs to this object and image"
+        "photograph {name}: the mask covers {share:.0} % of the object's outline at the given pose, \
+         expected at least {minimum:.0} %; check that the mask belongs to this object and image"
     )]
     Mask {
         /// Name of the photograph.
@@ -18,7 +19,7 @@ pub enum NolError {
         /// Part of the outline that the mask covers, per cent.
         share: f64,
         /// Smallest value accepted, per cent.
-        least: f64,
+        minimum: f64,
     },
     /// An option is out of range.
     #[error("{field}: expected {expected}, found {found}")]

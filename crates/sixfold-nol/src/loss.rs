@@ -115,7 +115,7 @@ mod tests {
     }
 
     #[test]
-    fn equation_4_1_counts_what_lies_in_the_mask() {
+    fn equation_4_1_counts_pixels_in_the_mask() {
         let device = Device::flex();
         let perceptual = Perceptual::Lite0(Box::new(imagenet_encoder(&device).unwrap()));
         let truth = Tensor::<4>::zeros([1, 3, 32, 32], &device);

@@ -13,7 +13,7 @@ use sixfold_nn::weights::{
 use crate::features::{Map, SourceFeatures};
 use crate::network::{CHANNELS, COLOURS, FEATURES, Network, Parts};
 use crate::projection::TargetSurface;
-use crate::samples::{Looked, look_up, order};
+use crate::samples::{Lookup, look_up, order};
 use crate::source::SourceView;
 
 /// Border around the visible pixels that is processed too, so that they are surrounded by zeros as in the training.
@@ -175,20 +175,20 @@ impl NolModel {
             seen: vec![false; points],
             weights: vec![0.0; points * sources.len()],
         };
-        let looked: Vec<Looked> = sources.par_iter().map(|source| look_up(source, target)).collect();
-        for point in looked.iter().flat_map(|l| &l.points) {
+        let lookup: Vec<Lookup> = sources.par_iter().map(|source| look_up(source, target)).collect();
+        for point in lookup.iter().flat_map(|l| &l.points) {
             rendering.seen[*point as usize] = true;
         }
         let Some(area) = Area::around(target, &rendering.seen) else { return rendering };
-        let order = order(&looked);
+        let order = order(&lookup);
         let pixels = area.width * area.height;
         let mut values = vec![0.0; order.len() * CHANNELS * pixels];
         let mut valid = vec![0.0; order.len() * pixels];
         values.par_chunks_mut(CHANNELS * pixels).zip(valid.par_chunks_mut(pixels)).zip(&order).for_each(
             |((values, valid), &source)| {
-                let (looked, features) = (&looked[source], &features[source]);
+                let (lookup, features) = (&lookup[source], &features[source]);
                 let mut at_place = [0.0; CHANNELS];
-                for ((point, pixel), cosine) in looked.points.iter().zip(&looked.pixels).zip(&looked.cosines)
+                for ((point, pixel), cosine) in lookup.points.iter().zip(&lookup.pixels).zip(&lookup.cosines)
                 {
                     let at = area.index(target, *point as usize);
                     features.sample(pixel[0], pixel[1], &mut at_place);

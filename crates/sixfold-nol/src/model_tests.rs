@@ -106,8 +106,8 @@ fn exact_poses_give_the_truth_whatever_the_weights() {
             assert!((sum - 1.0).abs() < 1e-4);
         }
         // The order of the sources does not matter.
-        let turned: Vec<SourceView> = [2, 0, 3, 1].map(|k: usize| sources[k].clone()).into();
-        let again = model.render(&target, &turned, &model.encode(&turned));
+        let permuted: Vec<SourceView> = [2, 0, 3, 1].map(|k: usize| sources[k].clone()).into();
+        let again = model.render(&target, &permuted, &model.encode(&permuted));
         assert_eq!(again.channels, rendering.channels);
         assert!((0..target.pixels.len()).all(|i| again.weights[4 * i + 1] == rendering.weights[4 * i]));
         // With one source the rendering shows that source.
@@ -119,7 +119,7 @@ fn exact_poses_give_the_truth_whatever_the_weights() {
 }
 
 #[test]
-fn what_no_source_sees_is_said() {
+fn unseen_pixels_are_reported() {
     let mesh = printed_box();
     let model = model(IntegratorKind::Lstm);
     let target = TargetSurface::new(&mesh, &camera(), &pose(0.0));

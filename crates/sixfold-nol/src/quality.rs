@@ -64,10 +64,10 @@ impl Quality {
             ("exact poses, averaging", self.exact_average),
         ]
         .into_iter()
-        .flat_map(|(name, likeness)| {
+        .flat_map(|(name, similarity)| {
             [
-                (format!("PSNR in dB, {name}"), likeness.psnr),
-                (format!("difference of features, {name}"), likeness.features),
+                (format!("PSNR in dB, {name}"), similarity.psnr),
+                (format!("difference of features, {name}"), similarity.features),
             ]
         })
         .collect()

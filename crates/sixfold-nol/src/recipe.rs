@@ -75,7 +75,7 @@ pub struct NolRecipe {
     pub backgrounds: Option<PathBuf>,
     /// Number of steps; `None`: the value of [`NolKind::options`], as for the next field.
     pub steps: Option<u64>,
-    /// Highest learning rate.
+    /// Maximum learning rate.
     pub learning_rate: Option<f64>,
     /// Seed of weights and samples.
     pub seed: u64,

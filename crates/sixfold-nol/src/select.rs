@@ -37,7 +37,7 @@ pub fn choose_images(object: &mut RoughObject, most: usize) -> Result<Vec<String
         let covered = view.visible_fraction();
         if covered < MIN_MASK {
             let name = image.posed.name().to_owned();
-            let wrong = NolError::Mask { name, share: 100.0 * covered, least: 100.0 * MIN_MASK };
+            let wrong = NolError::Mask { name, share: 100.0 * covered, minimum: 100.0 * MIN_MASK };
             notes.push(format!("{wrong}; left out"));
             shown.push(vec![]);
             continue;
@@ -46,8 +46,8 @@ pub fn choose_images(object: &mut RoughObject, most: usize) -> Result<Vec<String
     }
     let points = surface.points.len();
     shown.iter_mut().for_each(|s| s.resize(points, 0.0));
-    let least = if object.images.len() > most { 0.0 } else { MIN_GAIN * 0.01 };
-    let chosen = choose_by_surface(&shown, None, most, least);
+    let minimum = if object.images.len() > most { 0.0 } else { MIN_GAIN * 0.01 };
+    let chosen = choose_by_surface(&shown, None, most, minimum);
     let mut number = 0;
     object.images.retain(|_| {
         number += 1;
@@ -172,7 +172,7 @@ mod tests {
     use sixfold_geometry::nalgebra::UnitQuaternion;
 
     #[test]
-    fn the_one_that_shows_what_is_missing_comes_next() {
+    fn the_photograph_that_adds_missing_surface_comes_next() {
         let shown = vec![vec![1.0, 1.0, 1.0, 0.0], vec![1.0, 1.0, 0.0, 0.0], vec![0.0, 0.0, 0.0, 0.8]];
         assert_eq!(choose_by_surface(&shown, None, 2, 0.0), vec![0, 2]);
         assert_eq!(choose_by_surface(&shown, Some(&[true, true, false, false]), 1, 0.0), vec![0]);

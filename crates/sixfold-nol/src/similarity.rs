@@ -323,16 +323,16 @@ mod tests {
         let board = |x: usize, y: usize| 0.5 + 0.3 * ((x as f32 * 0.7).sin() * (y as f32 * 0.45).cos());
         let truth = patch(board);
         let image = patch(|x, y| board(x + 3, y.saturating_sub(2)));
-        let middle = without_border(&Mask::filled(32, 32, true), 4);
-        assert_eq!(middle.as_slice().iter().filter(|m| **m).count(), 24 * 24);
-        assert!(middle[(4, 4)] && middle[(27, 27)] && !middle[(3, 10)] && !middle[(10, 28)]);
-        let before = psnr_within(&image, &truth, &middle).unwrap();
-        let placed = in_place_of(&image, &truth, &middle, 4);
-        assert_eq!(psnr_within(&placed, &truth, &middle), Some(100.0), "{before}");
+        let inner = without_border(&Mask::filled(32, 32, true), 4);
+        assert_eq!(inner.as_slice().iter().filter(|m| **m).count(), 24 * 24);
+        assert!(inner[(4, 4)] && inner[(27, 27)] && !inner[(3, 10)] && !inner[(10, 28)]);
+        let before = psnr_within(&image, &truth, &inner).unwrap();
+        let placed = in_place_of(&image, &truth, &inner, 4);
+        assert_eq!(psnr_within(&placed, &truth, &inner), Some(100.0), "{before}");
         assert!(before < 30.0);
         // The shift is limited: it cannot reach this position.
-        let near = in_place_of(&image, &truth, &middle, 1);
-        assert!(psnr_within(&near, &truth, &middle).unwrap() < 60.0);
+        let near = in_place_of(&image, &truth, &inner, 1);
+        assert!(psnr_within(&near, &truth, &inner).unwrap() < 60.0);
         // A hole in a mask is a border.
         let hole = Mask::from_fn(32, 32, |x, y| (x, y) != (16, 16));
         assert!(!without_border(&hole, 2)[(14, 18)] && without_border(&hole, 2)[(13, 16)]);
@@ -349,8 +349,8 @@ mod tests {
         assert!((ssim_within(&a, &a, &left).unwrap() - 1.0).abs() < 1e-9);
         // A checkerboard with squares of one pixel, and its inverse: covariance -0.04, variances 0.04.
         let board = |sign: f32| patch(move |x, y| 0.5 + sign * if (x + y) % 2 == 0 { 0.2 } else { -0.2 });
-        let middle = Mask::filled(32, 32, true);
-        let found = ssim_within(&board(1.0), &board(-1.0), &middle).unwrap();
+        let inner = Mask::filled(32, 32, true);
+        let found = ssim_within(&board(1.0), &board(-1.0), &inner).unwrap();
         let expected = (-0.08 + C2) / (0.08 + C2);
         assert!((found - expected).abs() < 0.01, "{found} {expected}");
         assert_eq!(ssim_within(&a, &b, &Mask::filled(32, 32, false)), None);
@@ -366,7 +366,7 @@ mod tests {
     }
 
     #[test]
-    fn the_perceptual_distance_sees_blur_and_not_what_lies_beside() {
+    fn the_perceptual_distance_reacts_to_blur_within_the_mask_only() {
         let judge = ImageSimilarity::new().unwrap();
         let mask = Mask::from_fn(32, 32, |x, y| (8..24).contains(&x) && (8..24).contains(&y));
         let board = patch(|x, y| if (x / 4 + y / 4) % 2 == 0 { 0.8 } else { 0.2 });
@@ -387,7 +387,7 @@ mod tests {
     }
 
     #[test]
-    fn a_coarse_grid_knows_shares_of_the_mask() {
+    fn a_coarse_grid_holds_fractions_of_the_mask() {
         let mask = Mask::from_fn(4, 4, |x, y| x == 0 || y == 3);
         assert_eq!(cover(&mask, [2, 2]), vec![0.5, 0.0, 0.75, 0.5]);
     }

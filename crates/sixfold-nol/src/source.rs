@@ -164,7 +164,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_the_object_hides_of_itself_is_not_seen() {
+    fn self_occluded_points_are_not_visible() {
         // A plate of 10 cm, and one of 4 cm three centimetres in front of it, both facing the camera.
         let plate = |half: f64, z: f64| {
             [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)]

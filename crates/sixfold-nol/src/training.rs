@@ -105,9 +105,9 @@ impl NolTrainingOptions {
         OptionError::unless(all, "batch.sides", format!("{sides:?}"), expected)?;
         let sources = self.batch.max_sources;
         OptionError::unless((1..=16).contains(&sources), "batch.max_sources", sources, "1 to 16")?;
-        let least = self.batch.min_sources;
+        let minimum = self.batch.min_sources;
         let expected = "1 to batch.max_sources";
-        OptionError::unless((1..=sources).contains(&least), "batch.min_sources", least, expected)?;
+        OptionError::unless((1..=sources).contains(&minimum), "batch.min_sources", minimum, expected)?;
         OptionError::unless_weight("adversarial", self.adversarial)?;
         self.weights.iter().try_for_each(|weight| OptionError::unless_weight("weights", *weight))
     }
@@ -146,8 +146,8 @@ impl Choice for NolLosses {
         match self {
             NolLosses::L1 => "L1 of the colours alone",
             NolLosses::Image => "Colours and features (equation 4.1)",
-            NolLosses::Smooth => "The same and smoothness (equation 4.2)",
-            NolLosses::Gan => "The same and a discriminator that trains beside the network",
+            NolLosses::Smooth => "As image, plus smoothness (equation 4.2)",
+            NolLosses::Gan => "As smooth, plus a discriminator that is trained with the network",
         }
     }
 }
@@ -280,9 +280,9 @@ impl Training for NolTraining {
         if let Some(critic) = &mut self.critic {
             // Pixels that no source shows are left out of both.
             let (image, target) = (out.image * out.mask.clone(), out.target * out.mask);
-            let told = critic.step(image.clone().detach(), target, number_of_step, rate, &self.device);
+            let critic_loss = critic.step(image.clone().detach(), target, number_of_step, rate, &self.device);
             let adversarial = critic.generator_loss(image);
-            losses.extend([("discriminator", told), ("adversarial", number(&adversarial))]);
+            losses.extend([("discriminator", critic_loss), ("adversarial", number(&adversarial))]);
             sum = sum + adversarial * self.options.adversarial;
         }
         self.learner.descend(rate, sum);
@@ -359,7 +359,7 @@ mod tests {
     }
 
     #[test]
-    fn it_goes_on_where_it_stopped() {
+    fn it_resumes_from_its_last_checkpoint() {
         let textures = Backgrounds::procedural();
         let options = options(6);
         let go = |folder: &Path, stop_at: Option<u64>, sample_threads: usize| {

@@ -156,7 +156,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_view_looks_at_the_centre_from_where_it_should() {
+    fn a_view_is_directed_at_the_centre_from_its_direction() {
         let centre = Vec3::new(0.01, -0.02, 0.03);
         for (azimuth, elevation) in [(0.0, 0.0), (1.0, 0.5), (4.0, std::f64::consts::FRAC_PI_2), (2.0, -0.4)]
         {

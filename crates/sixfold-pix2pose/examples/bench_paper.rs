@@ -135,10 +135,10 @@ fn main() -> Result<(), Box<dyn Error>> {
         time(2, &|| drop(std::hint::black_box(pnp_ransac(&points, &pixels, &camera, &options))));
     }
     let [first, second, pnp] = times;
-    let told = serde_json::json!({
+    let summary = serde_json::json!({
         "first": first, "second": second, "pnp": pnp,
         "correspondences": points.len(), "degrees": degrees, "millimetres": millimetres,
     });
-    println!("{told}");
+    println!("{summary}");
     Ok(())
 }

@@ -79,7 +79,7 @@ pub fn estimate_aligned(
     mesh: &Mesh,
     options: &AlignOptions,
 ) -> Result<Option<Aligned>, EstimateError> {
-    let look = |region: &Rect| -> Result<Option<Aligned>, EstimateError> {
+    let run_pass = |region: &Rect| -> Result<Option<Aligned>, EstimateError> {
         let Some(found) = estimate(model, image, camera, object_id, region, &options.estimate)? else {
             return Ok(None);
         };
@@ -88,18 +88,18 @@ pub fn estimate_aligned(
         let (camera_from_object, improved) = (refined.camera_from_object, refined.improved);
         Ok(Some(Aligned { camera_from_object, score, improved, found }))
     };
-    let Some(mut best) = look(region)? else { return Ok(None) };
-    let mut looked_at = *region;
+    let Some(mut best) = run_pass(region)? else { return Ok(None) };
+    let mut last_box = *region;
     for _ in 1..options.looks.max(1) {
         let Some(whole) = projected_box(mesh, camera, &best.camera_from_object) else { break };
-        if !best.improved || !alike(&whole, region) || same(&whole, &looked_at) {
+        if !best.improved || !alike(&whole, region) || same(&whole, &last_box) {
             break;
         }
-        let Ok(Some(again)) = look(&whole) else { break };
+        let Ok(Some(again)) = run_pass(&whole) else { break };
         if !again.improved {
             break;
         }
-        (best, looked_at) = (again, whole);
+        (best, last_box) = (again, whole);
     }
     if options.correct && best.improved {
         let correction = model.object(object_id)?.1.correction;
@@ -189,10 +189,10 @@ fn corrections(shifts: &[Vec2], depths: BTreeMap<u32, Vec<f64>>) -> BTreeMap<u32
         .into_iter()
         .filter(|(_, values)| values.len() >= MIN_PHOTOGRAPHS)
         .map(|(id, mut values)| {
-            let middle = median(&mut values);
-            let mut away: Vec<f64> = values.iter().map(|v| (v - middle).abs()).collect();
+            let typical = median(&mut values);
+            let mut away: Vec<f64> = values.iter().map(|v| (v - typical).abs()).collect();
             let error = 1.2533 * 1.4826 * median(&mut away) / (values.len() as f64).sqrt();
-            (id, (middle, error * error))
+            (id, (typical, error * error))
         })
         .collect();
     let count = measured.len().max(1) as f64;
@@ -200,9 +200,9 @@ fn corrections(shifts: &[Vec2], depths: BTreeMap<u32, Vec<f64>>) -> BTreeMap<u32
     let noise = measured.values().map(|(_, e)| e).sum::<f64>() / count;
     let between = (scatter - noise).max(0.0);
     let correction = |id: u32| {
-        let depth = measured.get(&id).map_or(0.0, |(middle, error)| {
+        let depth = measured.get(&id).map_or(0.0, |(typical, error)| {
             let total = between + error;
-            if total > 0.0 { middle * between / total } else { 0.0 }
+            if total > 0.0 { typical * between / total } else { 0.0 }
         });
         Correction { shift, depth }
     };
@@ -219,10 +219,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn distances_count_as_far_as_they_stand_out_of_their_scatter() {
+    fn distances_count_if_significant_against_their_scatter() {
         let shifts: Vec<Vec2> = [0.9, 1.0, 1.1, 1.2, 30.0].map(|x| Vec2::new(x, -x)).to_vec();
-        let around = |middle: f64, scatter: f64| -> Vec<f64> {
-            (-4..=4).map(|i| middle + 0.25 * scatter * f64::from(i)).collect()
+        let around = |centre: f64, scatter: f64| -> Vec<f64> {
+            (-4..=4).map(|i| centre + 0.25 * scatter * f64::from(i)).collect()
         };
         let known = BTreeMap::from([
             (1, around(0.02, 0.001)),

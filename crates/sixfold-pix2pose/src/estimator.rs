@@ -78,7 +78,7 @@ impl Pix2PoseEstimator {
             (None, several) => {
                 let ids: Vec<String> = several.iter().map(|o| o.id.to_string()).collect();
                 let text =
-                    format!("--object-id N is missing: the model knows the objects {}", ids.join(", "));
+                    format!("--object-id N is missing: the model was trained on objects {}", ids.join(", "));
                 Err(EstimatorError::method(text))
             }
         }
@@ -212,7 +212,7 @@ impl PoseEstimator for Pix2PoseEstimator {
         self.options.check().map_err(EstimatorError::method)?;
         let image = query.rgb(METHOD)?;
         let region = query.region.ok_or(EstimatorError::Input {
-            what: "region that says where the object is",
+            what: "region that contains the object",
             method: METHOD,
             advice: "give --detector FILE.safetensors, --boxes, --box X,Y,W,H or --mask FILE",
         })?;

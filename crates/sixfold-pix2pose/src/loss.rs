@@ -171,8 +171,8 @@ impl Image<'_> {
             &pool[0]
         } else {
             let sums: Vec<f64> = pool.iter().map(|s| self.distance(&predictions, &weights, s)).collect();
-            let least = (0..pool.len()).min_by(|a, b| sums[*a].total_cmp(&sums[*b])).unwrap_or(0);
-            &pool[least]
+            let minimum = (0..pool.len()).min_by(|a, b| sums[*a].total_cmp(&sums[*b])).unwrap_or(0);
+            &pool[minimum]
         };
         let total = match self.kind {
             OutputKind::Paper => n as f32,

@@ -71,7 +71,8 @@ pub enum ModelError {
     },
     /// The model was not trained on this object.
     #[error(
-        "the model knows the objects {known}, not object {id}; train it (`sixfold train pix2pose`) or give other weights"
+        "the model was trained on objects {known}, not on object {id}; train it (`sixfold train pix2pose`) \
+         or give other weights"
     )]
     UnknownObject {
         /// The requested object.
@@ -82,7 +83,7 @@ pub enum ModelError {
 }
 
 /// Maximum number of objects of a compact network.
-const MOST_OBJECTS: usize = 1000;
+const MAX_OBJECTS: usize = 1000;
 /// Minimum size of a decoder in a file, bytes: 291,000 numbers of two bytes or more. A file cannot name more objects than it has
 /// decoders.
 const DECODER_BYTES: u64 = 500_000;
@@ -324,7 +325,7 @@ fn described(path: &Path, card: &ModelCard) -> Result<(Vec<ObjectEntry>, ImageSi
         let expected = "1 to 1000 objects, and 500 kB of the file for each";
         let bytes =
             std::fs::metadata(path).map_err(|source| WeightsError::Read { file: file(), source })?.len();
-        if !(1..=MOST_OBJECTS).contains(&count) || bytes < count as u64 * DECODER_BYTES {
+        if !(1..=MAX_OBJECTS).contains(&count) || bytes < count as u64 * DECODER_BYTES {
             return Err(wrong("objects", expected, format!("{count} in a file of {bytes} bytes")));
         }
     } else if count != 1 {

@@ -27,7 +27,7 @@ pub struct ObjectEntry {
 const SMALLEST: f64 = 0.001;
 const LARGEST: f64 = 10.0;
 /// Maximum number of outlier thresholds of an object: each of them is tried.
-const MOST_THRESHOLDS: usize = 16;
+const MAX_THRESHOLDS: usize = 16;
 
 /// The bounding boxes of mesh and model may differ by this fraction of the diameter: BOP's meshes for evaluation are simplified.
 const SAME_BOX: f64 = 0.05;
@@ -90,7 +90,7 @@ impl ObjectEntry {
             return Err(("objects.centre", "coordinates within 1000 m", format!("{:?}", self.centre)));
         }
         let count = self.thresholds.len();
-        if !(1..=MOST_THRESHOLDS).contains(&count) {
+        if !(1..=MAX_THRESHOLDS).contains(&count) {
             return Err(("objects.thresholds", "1 to 16 thresholds", format!("{count} thresholds")));
         }
         if !self.thresholds.iter().all(|t| *t > 0.0 && *t <= 1.0) {
@@ -241,7 +241,7 @@ mod tests {
     }
 
     #[test]
-    fn a_quarter_turn_of_a_box_with_unequal_sides_is_applied_in_metres() {
+    fn a_rotation_by_90_degrees_of_a_box_with_unequal_sides_is_applied_in_metres() {
         let scale =
             BoundingBoxScale { centre: Vec3::new(0.01, -0.02, 0.0), half_size: Vec3::new(0.1, 0.2, 0.05) };
         let turn = Pose::exp(&[0.0, 0.0, 0.0, 0.0, 0.0, std::f64::consts::FRAC_PI_2].into());

@@ -75,7 +75,7 @@ mod tests {
     }
 
     #[test]
-    fn the_threshold_keeps_what_is_visible_and_no_more() {
+    fn the_threshold_keeps_visible_pixels_only() {
         assert_eq!(chosen([0.05, 0.05, 0.05, 0.15, 0.25, 0.4], 3), 0.1);
         assert_eq!(chosen([0.05, 0.05, 0.15, 0.15, 0.25, 0.25], 4), 0.2);
         assert_eq!(chosen([0.05, 0.15, 0.15, 0.25, 0.25, 0.4], 5), 0.3);

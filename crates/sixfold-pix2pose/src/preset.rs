@@ -116,15 +116,15 @@ impl Preset {
             _ => Turns::None,
         };
         let centre = info.min + 0.5 * info.size;
-        let turned = |axis: Vec3, angle: f64| {
+        let rotated = |axis: Vec3, angle: f64| {
             let turn = Pose::exp(&[0.0, 0.0, 0.0, angle * axis.x, angle * axis.y, angle * axis.z].into());
             Pose::from_translation(centre) * turn * Pose::from_translation(-centre)
         };
         let symmetries_discrete = match turns {
             Turns::None | Turns::AnyZ => vec![],
-            Turns::HalfY => vec![turned(Vec3::y(), PI)],
-            Turns::HalfZ => vec![turned(Vec3::z(), PI)],
-            Turns::QuarterZ => [1.0, 2.0, 3.0].map(|n| turned(Vec3::z(), n * FRAC_PI_2)).to_vec(),
+            Turns::HalfY => vec![rotated(Vec3::y(), PI)],
+            Turns::HalfZ => vec![rotated(Vec3::z(), PI)],
+            Turns::QuarterZ => [1.0, 2.0, 3.0].map(|n| rotated(Vec3::z(), n * FRAC_PI_2)).to_vec(),
         };
         let any = ContinuousSymmetry { axis: Vec3::z(), offset: centre };
         let symmetries_continuous = if turns == Turns::AnyZ { vec![any] } else { vec![] };
@@ -184,7 +184,7 @@ mod tests {
     }
 
     #[test]
-    fn turns_are_about_the_middle_of_the_box() {
+    fn rotations_are_about_the_centre_of_the_box() {
         let info = info();
         let centre = info.min + 0.5 * info.size;
         let point = centre + Vec3::new(0.03, 0.01, 0.02);

@@ -78,7 +78,7 @@ pub struct Pix2PoseRecipe {
     pub steps: Option<u64>,
     /// Images of every object in a step.
     pub per_object: Option<usize>,
-    /// Highest learning rate.
+    /// Maximum learning rate.
     pub learning_rate: Option<f64>,
     /// Train against a discriminator; `None`: with one for the dissertation's networks, without one for the compact network.
     pub adversarial: Option<bool>,

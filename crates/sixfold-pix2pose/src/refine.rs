@@ -284,7 +284,7 @@ mod tests {
     }
 
     #[test]
-    fn what_covers_the_object_does_not_pull() {
+    fn occluders_do_not_bias_the_pose() {
         let [before, after] = errors(0.3);
         assert!(before > 0.03 && after < 0.012, "{before} {after}");
     }

@@ -130,7 +130,7 @@ mod tests {
     }
 
     #[test]
-    fn walls_near_the_centre_are_told_from_others() {
+    fn central_walls_are_classified() {
         let samples: Vec<Sample<ClosingRegion>> = (0..128).map(sample).collect();
         let device = Device::flex().autodiff();
         let options = crate::recipe::GpdRecipe::default().options();

@@ -2,7 +2,8 @@
 //! ones.
 //!
 //! As in the original (Fischinger, Weiss and Vincze 2015), features have one rectangle, or two to four with weights that sum to
-//! zero; a third of them are symmetric about the centre of the closing direction. The selection is by F-score (Chen and Lin 2006).
+//! zero; a quarter of them are symmetric about the centre of the closing direction. The selection is by F-score (Chen and Lin
+//! 2006).
 
 use rand::RngExt;
 use sixfold_geometry::random::{Random, stream};

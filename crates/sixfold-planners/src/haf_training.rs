@@ -229,7 +229,7 @@ mod tests {
     }
 
     #[test]
-    fn ridges_near_the_centre_are_told_from_others_and_a_stopped_training_ends_the_same() {
+    fn central_ridges_are_classified_and_an_interrupted_training_ends_the_same() {
         let seen = samples();
         let samples = Arc::new(HafSamples::new(&seen, 0));
         let folder = tempfile::tempdir().unwrap();

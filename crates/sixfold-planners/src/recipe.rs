@@ -108,7 +108,7 @@ fn with_quality(card: &mut ModelCard, quality: &PlannerQuality) {
 pub struct GpdRecipe {
     /// Options of both planners.
     pub common: PlannerOptions,
-    /// Highest learning rate; `None`: 0.001.
+    /// Maximum learning rate; `None`: 0.001.
     pub learning_rate: Option<f64>,
 }
 

@@ -59,8 +59,8 @@ impl BarChart {
         let at = self.axis(&mut canvas, (left, WIDTH as f64 - VALUES), (top, bottom));
         let mut y = top + 0.5 * GAP;
         for group in &self.groups {
-            let middle = y + 0.5 * BAR * group.values.len() as f64 - 3.5 * SMALL;
-            canvas.text(left - MARGIN - text_width(&group.label, SMALL), middle, SMALL, &group.label, INK);
+            let label_y = y + 0.5 * BAR * group.values.len() as f64 - 3.5 * SMALL;
+            canvas.text(left - MARGIN - text_width(&group.label, SMALL), label_y, SMALL, &group.label, INK);
             for (series, value) in group.values.iter().enumerate() {
                 let length = (at(*value) - left).max(0.0);
                 let color = COLORS[series % COLORS.len()];

@@ -164,7 +164,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_line_is_where_it_was_asked_for() {
+    fn a_line_is_drawn_at_its_coordinates() {
         let mut canvas = Canvas::new(40, 20);
         canvas.line((5.0, 10.0), (35.0, 10.0), 3.0, INK);
         let picture = canvas.finish();
@@ -175,7 +175,7 @@ mod tests {
     }
 
     #[test]
-    fn drawing_outside_the_picture_does_nothing() {
+    fn drawing_outside_the_canvas_does_nothing() {
         let mut canvas = Canvas::new(10, 10);
         canvas.line((-1e12, 5.0), (-5.0, 1e12), 2.0, INK);
         canvas.line((f64::NAN, 5.0), (5.0, 5.0), 2.0, INK);

@@ -40,13 +40,14 @@ pub enum ModelError {
     },
     /// Too many samples: their pairs would not fit into memory.
     #[error(
-        "{found} surface samples are seen from outside, at most {most} are taken: raise the sampling step or check the mesh for faces that cross each other"
+        "{found} surface samples are seen from outside, at most {maximum} are taken: raise the sampling \
+         step or check the mesh for faces that cross each other"
     )]
     TooManySamples {
         /// Samples found.
         found: usize,
         /// Maximum number of samples.
-        most: usize,
+        maximum: usize,
     },
     /// An option is out of range.
     #[error(transparent)]
@@ -246,12 +247,12 @@ impl ObjectModel {
         let directions = sphere_directions(VIEWS);
         let distance = VIEW_DISTANCE * diameter;
         let focal = VIEW_FILL * VIEW_PIXELS as f64 * distance / (diameter * VIEW_SPAN);
-        let middle = (VIEW_PIXELS as f64 - 1.0) / 2.0;
+        let principal = (VIEW_PIXELS as f64 - 1.0) / 2.0;
         let camera = Camera {
             fx: focal,
             fy: focal,
-            cx: middle,
-            cy: middle,
+            cx: principal,
+            cy: principal,
             width: VIEW_PIXELS,
             height: VIEW_PIXELS,
             distortion: None,
@@ -300,7 +301,7 @@ impl ObjectModel {
             return Err(ModelError::TooFewSamples { found: kept.len(), needed: MIN_SAMPLES });
         }
         if kept.len() > MAX_SAMPLES {
-            return Err(ModelError::TooManySamples { found: kept.len(), most: MAX_SAMPLES });
+            return Err(ModelError::TooManySamples { found: kept.len(), maximum: MAX_SAMPLES });
         }
         Ok(ObjectModel::assemble(
             Description { mesh: flat, options: *options, diameter, centre, samples: kept, visible_from },

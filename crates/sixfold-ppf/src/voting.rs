@@ -171,8 +171,8 @@ pub fn vote(model: &ObjectModel, cloud: &PointCloud, options: &VotingOptions) ->
     let step = model.diameter * model.options.sampling_step;
     let thinned = cloud.voxel_downsample(step, THINNING_ANGLE.to_radians());
     let Some(grid) = Grid::new(&thinned, model.diameter as f32) else { return vec![] };
-    let least = grid.points.len().div_ceil(options.max_references.max(1));
-    let stride = options.reference_stride.max(1).max(least);
+    let minimum = grid.points.len().div_ceil(options.max_references.max(1));
+    let stride = options.reference_stride.max(1).max(minimum);
     let references: Vec<usize> = (0..grid.points.len()).step_by(stride).collect();
     let model_points: Vec<V3> = model.samples.points.iter().map(|p| p.cast()).collect();
     let model_frames: Vec<[V3; 3]> = model.samples.normals.iter().map(|n| local_frame(&n.cast())).collect();
@@ -398,7 +398,7 @@ mod tests {
 
     /// Regression test: with a focal length of half a pixel the points are 12 km apart, and a grid of cells of 10 cm took 7.5 GB.
     #[test]
-    fn points_kilometres_apart_take_a_bounded_grid_with_the_same_partners() {
+    fn points_kilometres_apart_take_a_bounded_grid_with_the_same_neighbours() {
         let mut random = ChaCha8Rng::seed_from_u64(5);
         let mut points: Vec<Vec3> =
             (0..300).map(|_| Vec3::from_fn(|_, _| random.random_range(0.0..0.5))).collect();

@@ -84,7 +84,7 @@ fn model() -> ObjectModel {
 }
 
 #[test]
-fn a_noisy_partly_hidden_object_is_found_where_it_is() {
+fn a_noisy_partly_hidden_object_is_found_at_its_pose() {
     let (mesh, model) = (bracket(), model());
     let hider = boxes(&[([0.0, 0.0, 0.0], [0.05, 0.05, 0.07])]);
     for (seed, turn) in [(1, 0.4), (2, 2.0), (3, 1.2)] {
@@ -180,7 +180,7 @@ fn scores_of_exact_shifted_and_hidden_poses() {
 }
 
 #[test]
-fn what_hides_an_object_has_an_outline() {
+fn occluders_have_outlines() {
     let block = boxes(&[([-0.05, -0.05, 0.0], [0.05, 0.05, 0.1])]);
     let options = VerificationOptions::default();
     let printed = VerificationOptions { occluders_have_edges: false, ..options };
@@ -263,7 +263,7 @@ fn a_mask_keeps_the_other_instance_out() {
 }
 
 #[test]
-fn a_description_is_kept_and_a_bad_one_made_anew() {
+fn a_model_is_cached_and_a_damaged_one_recomputed() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("deep/bracket.ppf");
     let mesh = bracket();

@@ -49,7 +49,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_whole_object_is_in_the_portrait_and_fills_most_of_it() {
+    fn the_whole_object_is_visible_and_fills_most_of_the_image() {
         let corners: Vec<Vec3> = (0..8)
             .map(|i| Vec3::new(f64::from(i & 1), f64::from(i >> 1 & 1), f64::from(i >> 2)) * 0.1)
             .collect();

@@ -251,8 +251,8 @@ static QUANTILES: LazyLock<Vec<f32>> = LazyLock::new(|| {
         .map(|k| {
             let share = (f64::from(k) + 0.5) / 4096.0;
             while below < share {
-                let middle = x + 0.5 * step;
-                below += step * (-0.5 * middle * middle).exp() / std::f64::consts::TAU.sqrt();
+                let midpoint = x + 0.5 * step;
+                below += step * (-0.5 * midpoint * midpoint).exp() / std::f64::consts::TAU.sqrt();
                 x += step;
             }
             x as f32

@@ -45,7 +45,7 @@ function askForToken() {
   const wrong = element("p", { className: "status" });
   const form = element("form", {}, [
     element("h2", {}, ["This server needs its token"]),
-    element("label", {}, ["The token that it was started with", input]),
+    element("label", {}, ["The token with which it was started", input]),
     wrong,
     element("button", { className: "primary" }, ["Continue"]),
   ]);
@@ -59,7 +59,7 @@ function askForToken() {
       const body = JSON.stringify({ token: input.value });
       const response = await fetch("/v1/session", { method: "POST", body });
       if (!response.ok) {
-        wrong.textContent = "That is not its token.";
+        wrong.textContent = "Wrong token.";
         return;
       }
       dialog.remove();

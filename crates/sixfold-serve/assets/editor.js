@@ -460,13 +460,13 @@ export class Editor {
     const on = (id, what, options, said) => {
       byId(id).addEventListener("click", () => save(byId(id), to(what), options, said));
     };
-    on("pose-save", "pose", () => put({ camera_from_board: this.pose }), "The pose is kept.");
-    on("points-save", "pose", () => put({ pairs: this.pairs.map((pair) => ({ point: pair.point, pixel: this.full(pair.pixel) })) }), "The pose is kept: look at the outline.");
+    on("pose-save", "pose", () => put({ camera_from_board: this.pose }), "The pose is saved.");
+    on("points-save", "pose", () => put({ pairs: this.pairs.map((pair) => ({ point: pair.point, pixel: this.full(pair.pixel) })) }), "The pose is saved: check the outline.");
     on("left-out", "left_out", () => put({ left_out: this.photograph.state !== "left_out_by_person" }), "");
-    on("forget", "corrections", () => ({ method: "DELETE" }), "The program finds it again.");
+    on("forget", "corrections", () => ({ method: "DELETE" }), "The program will find pose and mask again.");
     byId("mask-save").addEventListener("click", async () => {
       const body = await this.maskPng();
-      save(byId("mask-save"), to("mask"), () => ({ method: "PUT", headers: { "Content-Type": "image/png" }, body }), "The mask is kept.");
+      save(byId("mask-save"), to("mask"), () => ({ method: "PUT", headers: { "Content-Type": "image/png" }, body }), "The mask is saved.");
     });
   }
 

@@ -16,7 +16,7 @@ function choice(object, chosen) {
 
 function found(result) {
   const status = [];
-  if (result.poses.length === 0) status.push(element("p", {}, ["Nothing was found that is sure enough."]));
+  if (result.poses.length === 0) status.push(element("p", {}, ["No pose was found with a sufficient confidence."]));
   if (result.not_found.length && result.poses.length) {
     status.push(element("p", { className: "muted" }, [`Not found: ${result.not_found.join(", ")}`]));
   }

@@ -70,7 +70,7 @@ export class Viewer {
     this.pointers = new Map();
     this.canvas = this.renderer.domElement;
     this.canvas.tabIndex = 0;
-    this.canvas.setAttribute("aria-label", "The object; drag or use the arrow keys to turn it");
+    this.canvas.setAttribute("aria-label", "The object; drag or use the arrow keys to rotate it");
     place.replaceChildren(this.canvas);
     this.listen();
     this.watched = new ResizeObserver(() => this.draw());

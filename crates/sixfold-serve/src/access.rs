@@ -32,14 +32,14 @@ pub(crate) struct Session {
 /// Whether a token is asked for.
 #[derive(Debug, Serialize, ToSchema)]
 pub(crate) struct SessionState {
-    /// Always true: another token is refused.
+    /// Always true: a wrong token is refused.
     accepted: bool,
 }
 
 /// Gives a page the cookie that stands for the token.
 #[utoipa::path(post, path = "/v1/session", tag = "server", request_body = Session, responses(
     (status = 200, description = "The cookie is set", body = SessionState),
-    (status = 401, description = "Another token", body = Problem),
+    (status = 401, description = "Wrong token", body = Problem),
     (status = 422, description = "No token in the body", body = Problem),
 ), security(()))]
 pub(crate) async fn session(State(app): Shared, body: axum::body::Bytes) -> Answer<Response> {

@@ -32,7 +32,7 @@ pub enum ServeError {
         option: &'static str,
         /// The given value.
         found: String,
-        /// What it may be.
+        /// The expected value.
         expected: String,
     },
     /// The server cannot listen on the address.
@@ -61,7 +61,7 @@ pub enum ServeError {
     Method(anyhow::Error),
 }
 
-/// What a client is told: `error` is the whole sentence, the other fields are its parts where they are known.
+/// An error as clients receive it: `error` is the whole sentence, the other fields are its parts if they are known.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub(crate) struct Problem {
     /// The whole message.
@@ -70,9 +70,9 @@ pub(crate) struct Problem {
     pub field: Option<String>,
     /// What the field may be.
     pub expected: Option<String>,
-    /// What it was.
+    /// The found value.
     pub found: Option<String>,
-    /// What to do.
+    /// Advice.
     pub advice: Option<String>,
 }
 

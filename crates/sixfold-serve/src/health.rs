@@ -19,21 +19,21 @@ pub(crate) struct Health {
     version: &'static str,
     /// Whether requests need a token.
     token_needed: bool,
-    /// Jobs that are worked on at once.
+    /// Number of jobs that are processed at the same time.
     workers: usize,
-    /// Jobs that wait.
+    /// Number of waiting jobs.
     queued: usize,
-    /// Jobs that are worked on.
+    /// Number of running jobs.
     running: usize,
-    /// Most pixels of an image.
+    /// Maximum pixels of an image.
     max_pixels: u64,
-    /// Most bytes of a request.
+    /// Maximum bytes of a request.
     max_upload: usize,
 }
 
-/// Whether the server lives, and its limits. Needs no token.
+/// Whether the server is running, and its limits. Needs no token.
 #[utoipa::path(get, path = "/v1/health", tag = "server", security(()), responses(
-    (status = 200, description = "It lives", body = Health),
+    (status = 200, description = "The server is running", body = Health),
 ))]
 pub(crate) async fn health(State(app): Shared) -> Json<Health> {
     let jobs = app.jobs.all();
@@ -50,7 +50,7 @@ pub(crate) async fn health(State(app): Shared) -> Json<Health> {
     })
 }
 
-/// What can be chosen.
+/// The available methods and grippers.
 #[derive(Debug, Serialize, ToSchema)]
 pub(crate) struct Choices {
     /// Methods for `/v1/find`; the first is the default.
@@ -59,9 +59,9 @@ pub(crate) struct Choices {
     grippers: Vec<&'static str>,
 }
 
-/// The methods and grippers that there are.
+/// The available methods and grippers.
 #[utoipa::path(get, path = "/v1/methods", tag = "server", responses(
-    (status = 200, description = "What can be chosen", body = Choices),
+    (status = 200, description = "The methods and grippers", body = Choices),
 ))]
 pub(crate) async fn methods(State(app): Shared) -> crate::error::Answer<Json<Choices>> {
     app.blocking(|app| {

@@ -334,7 +334,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_least_recently_used_go_and_replaced_ones_count_as_none() {
+    fn the_least_recently_used_are_removed_and_replaced_ones_do_not_count() {
         let stamp = |n| Stamp(None, n);
         let mut recent = Recent::new();
         for i in 0..MAX_KEPT as u32 {

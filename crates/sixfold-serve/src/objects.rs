@@ -43,18 +43,18 @@ pub(crate) struct ObjectView {
     /// Of the mesh; 0 without one.
     vertices: usize,
     faces: usize,
-    /// Whether it was added from depth images and has templates alone.
+    /// Whether it was added from depth images and has only templates.
     without_mesh: bool,
-    /// Rotations and translations that map it onto itself, without the identity.
+    /// Number of discrete symmetries, without the identity.
     symmetries_discrete: usize,
-    /// Axes that it may rotate about freely.
+    /// Number of its continuous symmetries.
     symmetries_continuous: usize,
     /// The file that it was added from, and its unit.
     source: String,
     source_unit: Option<String>,
     /// What its folder holds: files and their bytes.
     files: Vec<ObjectFile>,
-    /// Why its record cannot be read; the other fields then say nothing.
+    /// Why its record cannot be read; the other fields are then invalid.
     error: Option<String>,
     links: ObjectLinks,
 }
@@ -66,7 +66,7 @@ pub(crate) struct ObjectFile {
     bytes: u64,
 }
 
-/// Where more of an object is.
+/// Links of an object.
 #[derive(Debug, Serialize, ToSchema)]
 pub(crate) struct ObjectLinks {
     /// The object itself.
@@ -152,7 +152,7 @@ pub(crate) async fn list_objects(State(app): Shared) -> Answer<Json<ObjectList>>
 /// One stored object.
 #[utoipa::path(get, path = "/v1/objects/{name}", tag = "objects", params(("name" = String, Path, description = "Its name")), responses(
     (status = 200, description = "The object", body = ObjectView),
-    (status = 400, description = "No name that an object can have", body = Problem),
+    (status = 400, description = "Not a valid object name", body = Problem),
     (status = 404, description = "There is no such object", body = Problem),
 ))]
 pub(crate) async fn get_object(State(app): Shared, Path(name): Path<String>) -> Answer<Json<ObjectView>> {
@@ -167,10 +167,10 @@ pub(crate) async fn get_object(State(app): Shared, Path(name): Path<String>) -> 
 
 /// Removes a stored object.
 #[utoipa::path(delete, path = "/v1/objects/{name}", tag = "objects", params(("name" = String, Path, description = "Its name")), responses(
-    (status = 204, description = "It is gone"),
-    (status = 400, description = "No name that an object can have", body = Problem),
+    (status = 204, description = "Removed"),
+    (status = 400, description = "Not a valid object name", body = Problem),
     (status = 404, description = "There is no such object", body = Problem),
-    (status = 409, description = "Another process changes it", body = Problem),
+    (status = 409, description = "Another process is changing it", body = Problem),
 ))]
 pub(crate) async fn delete_object(State(app): Shared, Path(name): Path<String>) -> Answer<StatusCode> {
     app.blocking(move |app| app.store.remove(&name).map_err(|e| ApiError::of_store("name", &e))).await?;
@@ -202,7 +202,7 @@ impl Thumbnails {
 /// An image of a stored object, rendered from above and in front.
 #[utoipa::path(get, path = "/v1/objects/{name}/thumbnail.png", tag = "objects", params(("name" = String, Path, description = "Its name")), responses(
     (status = 200, description = "The image, 320 x 320", body = Vec<u8>, content_type = "image/png"),
-    (status = 400, description = "No name that an object can have", body = Problem),
+    (status = 400, description = "Not a valid object name", body = Problem),
     (status = 404, description = "There is no such object, or it has no mesh", body = Problem),
 ))]
 pub(crate) async fn object_thumbnail(State(app): Shared, Path(name): Path<String>) -> Answer<Response> {
@@ -241,14 +241,14 @@ fn portrait(mesh: &Mesh) -> RgbImage {
     let tilt = Rotation3::from_axis_angle(&Vector3::x_axis(), 120f64.to_radians());
     let turn = Rotation3::from_axis_angle(&Vector3::z_axis(), 30f64.to_radians());
     let rotation = UnitQuaternion::from_rotation_matrix(&(tilt * turn));
-    let middle = rotation * ((low + high) * 0.5);
+    let box_centre = rotation * ((low + high) * 0.5);
     // As near as possible: the vertices determine the smallest distance at which the object fits.
     let half = FILLED * 0.5 * SIDE as f64;
     let far_enough = mesh.vertices().iter().map(|v| {
-        let v = rotation * v - middle;
+        let v = rotation * v - box_centre;
         focal / half * v.x.abs().max(v.y.abs()) - v.z
     });
-    let pose = Pose::new(rotation, Vec3::new(0.0, 0.0, far_enough.fold(0.0, f64::max)) - middle);
+    let pose = Pose::new(rotation, Vec3::new(0.0, 0.0, far_enough.fold(0.0, f64::max)) - box_centre);
     let objects = [SceneObject { mesh, camera_from_object: pose }];
     let mut frame = VisibilityBuffer::new(&camera);
     frame.render(&objects, &RenderOptions::default());
@@ -256,16 +256,16 @@ fn portrait(mesh: &Mesh) -> RgbImage {
     shade(&frame, &objects, &Light::default_set(), &Material::default(), Some(&ground))
 }
 
-/// A rotation that maps the mesh onto itself, or nearly.
+/// A rotation that maps the mesh onto itself, exactly or nearly.
 #[derive(Debug, Clone, Serialize, Deserialize, ToSchema)]
 pub(crate) struct SymmetryView {
     /// Direction in the object's frame.
     axis: [f64; 3],
-    /// Rotations by multiples of a full turn over this; null: all rotations.
+    /// Order: rotations by multiples of 360 degrees over this number; null: all rotations.
     order: Option<u32>,
-    /// 95 of 100 points stay this near to the surface, metres.
+    /// After the rotation, 95 % of the points are within this distance of the surface, metres.
     deviation: f64,
-    /// It is stored with the object; others are to be inspected.
+    /// It is stored with the object; other symmetries need inspection.
     sure: bool,
 }
 
@@ -280,7 +280,7 @@ impl SymmetryView {
     }
 }
 
-/// How fine a mesh is sent.
+/// Resolution of a mesh.
 #[derive(Debug, Deserialize, IntoParams)]
 #[into_params(parameter_in = Query)]
 pub(crate) struct MeshDetail {
@@ -310,9 +310,9 @@ pub(crate) fn mesh_ply(mesh: &Mesh, faces: usize) -> Answer<Vec<u8>> {
 /// The mesh of a stored object: binary PLY in metres with colours, a texture's too.
 #[utoipa::path(get, path = "/v1/objects/{name}/mesh.ply", tag = "objects", params(("name" = String, Path, description = "Its name"), MeshDetail), responses(
     (status = 200, description = "The mesh", body = Vec<u8>, content_type = "model/ply"),
-    (status = 400, description = "No name that an object can have", body = Problem),
+    (status = 400, description = "Not a valid object name", body = Problem),
     (status = 404, description = "There is no such object, or it has no mesh", body = Problem),
-    (status = 422, description = "Fewer faces than a mesh is reduced to", body = Problem),
+    (status = 422, description = "Fewer faces than the minimum", body = Problem),
 ))]
 pub(crate) async fn object_mesh(
     State(app): Shared,

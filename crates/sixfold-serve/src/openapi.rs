@@ -13,9 +13,10 @@ use crate::{access, health, jobs, objects, tasks};
 #[openapi(
     info(
         title = "Sixfold",
-        description = "6D poses of known objects, and grasps. Lengths are metres, poses are 4x4 matrices by rows that take points \
-                       of the object's (or gripper's) frame to the camera's: x right, y down, z forward. Requests that take time \
-                       become jobs: 202 with links to events, result and overlay."
+        description = "6D poses of known objects, and grasps. Lengths are metres; poses are 4x4 matrices, \
+             row by row, that \
+                       transform points of the object's (or gripper's) frame into the camera's: x right, y down, z forward. \
+                       Long requests become jobs: 202 with links to events, result and overlay."
     ),
     paths(
         health::health,
@@ -46,7 +47,7 @@ use crate::{access, health, jobs, objects, tasks};
         (name = "objects", description = "Stored objects"),
         (name = "find", description = "Poses of stored objects in an image"),
         (name = "grasps", description = "Grasps on a depth image"),
-        (name = "jobs", description = "What was asked for, and what came of it"),
+        (name = "jobs", description = "Accepted requests, their state and results"),
     )
 )]
 struct Description;
@@ -72,7 +73,7 @@ struct Description;
         teachings::set_left_out,
         teachings::forget_corrections,
     ),
-    tags((name = "teachings", description = "Objects that are learnt from photographs on the printed board"))
+    tags((name = "teachings", description = "Objects learned from photographs on the printed board"))
 )]
 struct WithNetworks;
 

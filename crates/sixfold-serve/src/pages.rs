@@ -92,7 +92,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn pages_load_only_what_is_here() {
+    fn pages_load_only_from_this_server() {
         let scripts = ASSETS.iter().filter(|a| a.1 == SCRIPT && !a.0.contains("vendor"));
         let scripts = scripts.map(|(path, _, bytes)| (*path, String::from_utf8(bytes.to_vec()).unwrap()));
         for (path, text) in PAGES.iter().map(|page| (page.0, html(page))).chain(scripts) {

@@ -12,7 +12,7 @@ use crate::lens::Lens;
 /// Residuals of this many standard deviations get half the weight. Chosen by hand; not swept.
 const CAUCHY: f64 = 2.0;
 /// Smallest standard deviation of a residual, pixels. Chosen by hand; not swept.
-const LEAST_DEVIATION: f64 = 1e-3;
+const MIN_DEVIATION: f64 = 1e-3;
 /// Number of parts of the sums. Chosen by hand; not swept.
 const PARTS: usize = 8;
 /// Residual of an observation behind its camera, pixels. Chosen by hand; not swept.
@@ -63,7 +63,7 @@ impl Bundle {
             let residuals = seen.iter().filter_map(|s| self.residual(s, point));
             all.extend(residuals.flat_map(|r| [r.x.abs(), r.y.abs()]));
         }
-        median(&mut all).map_or(1.0, |m| (1.4826 * m).max(LEAST_DEVIATION))
+        median(&mut all).map_or(1.0, |m| (1.4826 * m).max(MIN_DEVIATION))
     }
 
     fn cost(&self, seen: &[Vec<Seen>], deviation: f64, guess: &Lens, free: &[usize]) -> f64 {

@@ -12,14 +12,14 @@ pub enum LeftOut {
         /// How many it has.
         found: usize,
         /// How many are needed.
-        least: usize,
+        minimum: usize,
     },
     /// Too few matches with any other photograph.
     FewMatches {
         /// The largest number of matches with another photograph that agree with one camera motion.
         found: usize,
         /// How many are needed.
-        least: usize,
+        minimum: usize,
     },
     /// It matches other photographs, but none of the largest group.
     OtherGroup {
@@ -39,11 +39,12 @@ impl LeftOut {
     /// The reason in words; `name` returns the name of a photograph.
     pub fn reason(&self, name: &dyn Fn(usize) -> String) -> String {
         match self {
-            LeftOut::FewFeatures { found, least } => {
-                format!("{found} features, expected at least {least}: blurred, or without texture?")
+            LeftOut::FewFeatures { found, minimum } => {
+                format!("{found} features, expected at least {minimum}: blurred, or without texture?")
             }
-            LeftOut::FewMatches { found, least } => format!(
-                "at most {found} features match another photograph, expected at least {least}: blurred, or taken too far from the others?"
+            LeftOut::FewMatches { found, minimum } => format!(
+                "at most {found} features match another photograph, expected at least {minimum}: blurred, \
+                 or taken too far from the others?"
             ),
             LeftOut::OtherGroup { group } => {
                 let others: Vec<String> = group.iter().map(|i| name(*i)).collect();
@@ -66,25 +67,25 @@ impl LeftOut {
 #[non_exhaustive]
 pub enum SfmError {
     /// Too few photographs.
-    #[error("{found} photographs match each other, expected at least {least}")]
+    #[error("{found} photographs match each other, expected at least {minimum}")]
     TooFew {
         /// How many match.
         found: usize,
         /// How many are needed.
-        least: usize,
+        minimum: usize,
         /// For each photograph, why it does not match; `None` for those that match.
         left_out: Vec<Option<LeftOut>>,
     },
     /// The camera only rotated.
     #[error(
         "all photographs are taken from one place: the largest angle between two rays to one point is {degrees:.2} degrees, expected \
-         at least {least:.1}; walk around the object"
+         at least {minimum:.1}; walk around the object"
     )]
     NoBaseline {
         /// The largest median angle of a pair.
         degrees: f64,
         /// What is needed.
-        least: f64,
+        minimum: f64,
     },
     /// Lists of different lengths, or a match beyond a photograph's features.
     #[error("matches of photographs {first} and {second}: {what}")]

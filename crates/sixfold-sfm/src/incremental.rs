@@ -43,7 +43,7 @@ pub(crate) struct Growing<'a> {
 
 impl<'a> Growing<'a> {
     /// Starts with two photographs and the motion between them; `None` if they have too few points in common.
-    pub fn begun(
+    pub fn started(
         pixels: &'a [Vec<Vec2>],
         tracks: &'a [Track],
         options: &'a SfmOptions,
@@ -133,9 +133,9 @@ impl<'a> Growing<'a> {
 
     fn register(&mut self, photograph: usize) -> Result<(), LeftOut> {
         let known = self.known_in(photograph);
-        let (least, of) = (self.options.min_matches / 2, known.len());
+        let (minimum, of) = (self.options.min_matches / 2, known.len());
         let few = |found: usize| LeftOut::FewInliers { found, of };
-        if of < least {
+        if of < minimum {
             return Err(few(of));
         }
         let points: Vec<Vec3> =
@@ -148,7 +148,7 @@ impl<'a> Growing<'a> {
             ..PnpOptions::default()
         };
         let found = pnp_ransac(&points, &pixels, &self.lens.camera(), &options).map_err(|_| few(0))?;
-        let enough = found.inlier_count >= least && found.inlier_count as f64 >= AGREEING * of as f64;
+        let enough = found.inlier_count >= minimum && found.inlier_count as f64 >= AGREEING * of as f64;
         if !enough {
             return Err(few(found.inlier_count));
         }

@@ -40,10 +40,10 @@ pub struct PairMatches {
     pub matches: Vec<(u32, u32)>,
 }
 
-/// Mutual nearest neighbours in every pair of photographs whose descriptors' product is at least `least`, with the rotation of the
-/// second photograph that gives most matches; `None` when `progress` asked to stop. All descriptors have the same length, and
+/// Mutual nearest neighbours in every pair of photographs whose descriptors' product is at least `minimum`, with the rotation of
+/// the second photograph that gives most matches; `None` when `progress` asked to stop. All descriptors have the same length, and
 /// features are sorted best first.
-pub fn matched(features: &[Features], least: f32, progress: &dyn Progress) -> Option<Vec<PairMatches>> {
+pub fn matched(features: &[Features], minimum: f32, progress: &dyn Progress) -> Option<Vec<PairMatches>> {
     let matrices: Vec<Vec<DMatrix<f32>>> = features.iter().map(Features::matrices).collect();
     let pairs: Vec<(usize, usize)> =
         (0..features.len()).flat_map(|a| (a + 1..features.len()).map(move |b| (a, b))).collect();
@@ -55,7 +55,7 @@ pub fn matched(features: &[Features], least: f32, progress: &dyn Progress) -> Op
             use std::sync::atomic::Ordering::Relaxed;
             let mut matches = vec![];
             if go.load(Relaxed) {
-                matches = best_matches(&matrices[*a][0], &matrices[*b], least);
+                matches = best_matches(&matrices[*a][0], &matrices[*b], minimum);
                 let count = done.fetch_add(1, Relaxed) + 1;
                 if !progress.report(count, pairs.len()) {
                     go.store(false, Relaxed);
@@ -68,20 +68,20 @@ pub fn matched(features: &[Features], least: f32, progress: &dyn Progress) -> Op
 }
 
 /// The matches with one of several sets of descriptors of the same points, the one with most among the first features.
-fn best_matches(a: &DMatrix<f32>, b: &[DMatrix<f32>], least: f32) -> Vec<(u32, u32)> {
+fn best_matches(a: &DMatrix<f32>, b: &[DMatrix<f32>], minimum: f32) -> Vec<(u32, u32)> {
     let first = |m: &DMatrix<f32>| m.columns(0, m.ncols().min(SCREENED)).into_owned();
     let best = if b.len() > 1 {
         let few = first(a);
-        let counts: Vec<usize> = b.iter().map(|b| mutual(&few, &first(b), least).len()).collect();
+        let counts: Vec<usize> = b.iter().map(|b| mutual(&few, &first(b), minimum).len()).collect();
         // The first one of several with equal counts.
         (0..b.len()).max_by_key(|k| (counts[*k], std::cmp::Reverse(*k))).unwrap_or(0)
     } else {
         0
     };
-    mutual(a, &b[best], least)
+    mutual(a, &b[best], minimum)
 }
 
-fn mutual(a: &DMatrix<f32>, b: &DMatrix<f32>, least: f32) -> Vec<(u32, u32)> {
+fn mutual(a: &DMatrix<f32>, b: &DMatrix<f32>, minimum: f32) -> Vec<(u32, u32)> {
     if a.ncols() == 0 || b.ncols() == 0 || a.nrows() != b.nrows() {
         return vec![];
     }
@@ -102,7 +102,7 @@ fn mutual(a: &DMatrix<f32>, b: &DMatrix<f32>, least: f32) -> Vec<(u32, u32)> {
         best_of_b.push(best);
     }
     let chosen = |(i, (product, j)): (usize, &(f32, u32))| {
-        let mutual = best_of_b[*j as usize].1 == i as u32 && *product >= least;
+        let mutual = best_of_b[*j as usize].1 == i as u32 && *product >= minimum;
         mutual.then_some((i as u32, *j))
     };
     best_of_a.iter().enumerate().filter_map(chosen).collect()
@@ -129,7 +129,7 @@ mod tests {
     }
 
     #[test]
-    fn the_rotation_that_matches_most_is_taken() {
+    fn the_rotation_with_most_matches_is_used() {
         let a = features(&[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]);
         let mut b = features(&[[-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]]);
         assert_eq!(matched(&[a.clone(), b.clone()], 0.5, &()).unwrap()[0].matches, [(1, 1)]);

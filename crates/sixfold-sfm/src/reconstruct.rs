@@ -95,14 +95,14 @@ pub fn reconstruct(
         pairs.into_iter().filter(|(p, ..)| group.contains(&p.0) && group.contains(&p.1)).collect();
     let degrees = pairs.iter().map(|(_, views, _)| views.angle).fold(0.0, f64::max);
     if degrees < options.min_angle {
-        return Err(SfmError::NoBaseline { degrees, least: options.min_angle });
+        return Err(SfmError::NoBaseline { degrees, minimum: options.min_angle });
     }
     let tracks = tracks_of(pixels, &pairs);
     let go = |done: usize| progress.report(matches.len() + done, total);
     let best = best_beginning(pixels, &tracks, &pairs, &group, &lens, options, &go)?;
     let found = best.filter(|b| b.registered() >= options.min_photographs);
     let Some(mut state) = found else {
-        return Err(SfmError::TooFew { found: 0, least: options.min_photographs, left_out });
+        return Err(SfmError::TooFew { found: 0, minimum: options.min_photographs, left_out });
     };
     state.adjust(50);
     state.adjust(50);
@@ -230,20 +230,20 @@ fn largest_group(
         if largest.contains(&i) && largest.len() > 1 {
             return None;
         }
-        let (found, least) = (pixels[i].len(), options.min_features);
-        if found < least {
-            return Some(LeftOut::FewFeatures { found, least });
+        let (found, minimum) = (pixels[i].len(), options.min_features);
+        if found < minimum {
+            return Some(LeftOut::FewFeatures { found, minimum });
         }
         let own = members(group[i]);
         if own.len() > 1 {
             return Some(LeftOut::OtherGroup { group: own.into_iter().filter(|k| *k != i).collect() });
         }
-        Some(LeftOut::FewMatches { found: most[i], least: options.min_matches })
+        Some(LeftOut::FewMatches { found: most[i], minimum: options.min_matches })
     };
     let left_out: Vec<Option<LeftOut>> = (0..count).map(reason).collect();
     if largest.len() < options.min_photographs.max(2) {
         let found = if largest.len() > 1 { largest.len() } else { 0 };
-        return Err(SfmError::TooFew { found, least: options.min_photographs, left_out });
+        return Err(SfmError::TooFew { found, minimum: options.min_photographs, left_out });
     }
     Ok((largest, left_out))
 }
@@ -276,7 +276,7 @@ fn best_beginning<'a>(
     let beginnings = order.iter().flat_map(|(pair, v, _)| v.motions.iter().map(move |m| (*pair, m)));
     let mut best: Option<Growing<'a>> = None;
     for (pair, motion) in beginnings.take(BEGINNINGS) {
-        let Some(mut state) = Growing::begun(pixels, tracks, options, lens, pair, motion) else { continue };
+        let Some(mut state) = Growing::started(pixels, tracks, options, lens, pair, motion) else { continue };
         if !state.grow(group, go) {
             return Err(SfmError::Stopped);
         }

@@ -142,7 +142,7 @@ fn a_camera_that_is_a_guess_is_found_too() {
 }
 
 #[test]
-fn a_focal_length_that_the_camera_names_helps_with_a_lens_that_nobody_guesses() {
+fn a_focal_length_in_the_file_helps_with_an_unusual_lens() {
     // The telephoto lens of a phone: 77 mm on 35 mm film.
     let truth = Camera::new(2278.0, 2278.0, 511.5, 383.5, 1024, 768).unwrap();
     let scene = Scene::new(around(12), truth, false, 0.5, 0.1);
@@ -197,7 +197,7 @@ fn the_larger_of_two_groups_is_kept_and_the_others_are_named() {
 fn too_few_photographs_and_bad_matches_are_refused() {
     let scene = Scene::new(around(12)[..2].to_vec(), camera(), false, 0.3, 0.0);
     let error = scene.found(&scene.camera, &SfmOptions::default()).unwrap_err();
-    assert!(matches!(error, SfmError::TooFew { found: 2, least: 3, .. }), "{error}");
+    assert!(matches!(error, SfmError::TooFew { found: 2, minimum: 3, .. }), "{error}");
     let mut scene = Scene::new(around(12)[..4].to_vec(), camera(), false, 0.3, 0.0);
     scene.matches[0].matches[3].1 = 300;
     let error = scene.found(&scene.camera, &SfmOptions::default()).unwrap_err();
@@ -223,14 +223,14 @@ fn a_photograph_with_few_matches_is_named_with_their_number() {
         m.matches.extend((20..32).map(|i| (i, 299 - i)));
     }
     let found = scene.found(&scene.camera, &SfmOptions { min_matches: 28, ..options }).unwrap();
-    let Err(LeftOut::FewMatches { found, least: 28 }) = found.camera_from_world[7] else {
+    let Err(LeftOut::FewMatches { found, minimum: 28 }) = found.camera_from_world[7] else {
         panic!("{:?}", found.camera_from_world[7]);
     };
     assert!((20..28).contains(&found), "{found}");
 }
 
 #[test]
-fn what_moved_between_photographs_is_left_out() {
+fn unrelated_photographs_are_left_out() {
     let mut scene = Scene::new(around(10), camera(), false, 0.3, 0.0);
     let mut random = stream(8, 0);
     scene.pixels[4]

@@ -19,7 +19,7 @@ pub struct DepthViewArguments {
     /// Depth images of an object that has no mesh: its templates for `estimate --method mttm`
     #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with = "mesh", requires = "masks", requires = "camera")]
     pub depth: Vec<PathBuf>,
-    /// Where the object is in each of them (PNG, above zero inside), in the same order
+    /// Masks of the object in the depth images (PNG, above zero inside), in the same order
     #[arg(long = "mask", value_name = "FILE", num_args = 1.., requires = "depth", conflicts_with = "mesh")]
     pub masks: Vec<PathBuf>,
     /// Use masks unchanged. By default they are checked against depth: the table and surfaces beyond depth edges are removed,
@@ -87,7 +87,8 @@ pub fn templates_of(a: &DepthViewArguments) -> Result<(ObjectTemplates, Vec<Left
     }
     if a.masks.len() != a.depth.len() {
         bail!(
-            "--mask: found {} masks for {} depth images, expected one for each: templates need to know what is the object",
+            "--mask: found {} masks for {} depth images, expected one for each: a template needs the mask \
+             of the object",
             a.masks.len(),
             a.depth.len()
         );

@@ -161,7 +161,7 @@ mod tests {
     }
 
     #[test]
-    fn a_label_stands_above_what_it_names_and_a_second_one_near_it() {
+    fn a_label_is_above_its_object_and_a_second_one_near_it() {
         let of = [70.0, 60.0, 90.0, 100.0];
         let found = places(&[label("can 0.91", of), label("can 0.32", of)], (160, 120), 1);
         let first = found[0].unwrap();
@@ -171,7 +171,7 @@ mod tests {
     }
 
     #[test]
-    fn what_finds_no_room_is_left_out_and_a_long_name_keeps_its_number() {
+    fn labels_without_room_are_left_out_and_long_names_keep_their_number() {
         let labels = vec![label("a", [0.0; 4]); 100];
         assert_eq!(places(&labels, (16, 20), 1).into_iter().flatten().count(), 4);
         assert_eq!(places(&labels, (16, 9), 1), vec![None; 100]);

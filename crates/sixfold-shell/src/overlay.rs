@@ -190,10 +190,10 @@ fn surface(image: &mut RgbImage, mask: &Mask, pose: &Drawn<'_>, shade: impl Fn(u
     let inside =
         |x: isize, y: isize| x >= 0 && y >= 0 && mask.get(x as usize, y as usize).copied().unwrap_or(false);
     // Dashes are angular sectors about the box's centre, sized to give about the wanted length along the outline.
-    let middle = [0.5 * (left + right), 0.5 * (top + bottom)];
+    let centre = [0.5 * (left + right), 0.5 * (top + bottom)];
     let dashes = (2.0 * (right - left + bottom - top) / DASH).round().max(4.0);
     let is_gap = |x: usize, y: usize| {
-        let angle = (y as f64 - middle[1]).atan2(x as f64 - middle[0]) / std::f64::consts::TAU;
+        let angle = (y as f64 - centre[1]).atan2(x as f64 - centre[0]) / std::f64::consts::TAU;
         !pose.is_sure() && (dashes * angle).rem_euclid(1.0) < 0.5
     };
     for (x, y) in (top as usize..bottom as usize)
@@ -266,8 +266,8 @@ fn rectangle(image: &mut RgbImage, [left, top, right, bottom]: Corners, color: [
 
 /// A small text on a coloured background with its lower left corner at a point, moved to stay within the image.
 pub fn label(image: &mut RgbImage, [x, y]: [f64; 2], text: &str, color: [u8; 3]) {
-    let middle = x + 0.5 * (6 * text.chars().count() + 2) as f64;
-    let label = Label { text: text.into(), of: [middle, y, middle, y], color, is_sure: true };
+    let centre = x + 0.5 * (6 * text.chars().count() + 2) as f64;
+    let label = Label { text: text.into(), of: [centre, y, centre, y], color, is_sure: true };
     draw_labels(image, &[label]);
 }
 
@@ -359,12 +359,12 @@ mod tests {
         let mesh = square();
         let image = RgbImage::filled(160, 120, [0; 3]);
         let sure = draw(&image, &camera(), &[drawn(&mesh, 0.0, 0.51)]);
-        let doubtful = draw(&image, &camera(), &[drawn(&mesh, 0.0, 0.49)]);
+        let uncertain = draw(&image, &camera(), &[drawn(&mesh, 0.0, 0.49)]);
         assert!(left_edge(&sure).iter().all(|set| *set));
-        let (set, gaps): (Vec<bool>, Vec<bool>) = left_edge(&doubtful).into_iter().partition(|set| *set);
+        let (set, gaps): (Vec<bool>, Vec<bool>) = left_edge(&uncertain).into_iter().partition(|set| *set);
         assert!(set.len() > 10 && gaps.len() > 10, "{} {}", set.len(), gaps.len());
         let inside = |image: &RgbImage| image[(64, 70)][0];
-        assert!(inside(&doubtful) > 20 && inside(&doubtful) < inside(&sure), "{}", inside(&doubtful));
+        assert!(inside(&uncertain) > 20 && inside(&uncertain) < inside(&sure), "{}", inside(&uncertain));
     }
 
     #[test]
@@ -383,7 +383,7 @@ mod tests {
     }
 
     #[test]
-    fn a_mask_stands_for_an_object_without_a_mesh() {
+    fn a_mask_represents_an_object_without_a_mesh() {
         let pixels: Vec<u32> = (50..70).flat_map(|y| (60..90).map(move |x| y * 160 + x)).collect();
         let image = RgbImage::filled(160, 120, [0; 3]);
         let shape = Shape::Pixels(&pixels);

@@ -11,7 +11,7 @@ use crate::screen::{self, Failure, printable};
 
 static INTERRUPTED: AtomicBool = AtomicBool::new(false);
 /// Whether the command checks [`INTERRUPTED`], because it has something to finish or to keep.
-static LOOKED_AT: AtomicBool = AtomicBool::new(false);
+static INTERRUPT_IS_CHECKED: AtomicBool = AtomicBool::new(false);
 
 /// The first interrupt asks a command that checks for interrupts to stop after its current step. It ends any other command
 /// at once, since those write nothing before their end, or only whole files. The second interrupt ends every command.
@@ -19,7 +19,7 @@ pub fn catch_interrupts() {
     // Without a handler an interrupt ends the program at once, which loses nothing that is on disk.
     let _ = ctrlc::set_handler(|| {
         let again = INTERRUPTED.swap(true, Ordering::SeqCst);
-        if again || !LOOKED_AT.load(Ordering::SeqCst) {
+        if again || !INTERRUPT_IS_CHECKED.load(Ordering::SeqCst) {
             let how = if again { "stopped at once" } else { "nothing was finished" };
             screen::fail(&format!("interrupted; {how}"), Failure::Interrupt);
             std::process::exit(2);
@@ -30,7 +30,7 @@ pub fn catch_interrupts() {
 
 /// Set once the user has asked to stop, for jobs that check it themselves.
 pub fn interrupted() -> &'static AtomicBool {
-    LOOKED_AT.store(true, Ordering::SeqCst);
+    INTERRUPT_IS_CHECKED.store(true, Ordering::SeqCst);
     &INTERRUPTED
 }
 

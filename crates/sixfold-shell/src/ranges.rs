@@ -19,17 +19,17 @@ pub fn in_range<T: PartialOrd + Display>(option: &str, value: T, range: RangeInc
 }
 
 /// Largest number of threads: more only cost memory.
-const MOST_THREADS: usize = 1024;
+const MAX_THREADS: usize = 1024;
 
 /// Longest time on the command line, seconds.
-const MOST_SECONDS: f64 = 3600.0;
+const MAX_SECONDS: f64 = 3600.0;
 
 /// Parses a number of threads.
 ///
 /// # Errors
 /// What is wrong with it.
 pub fn threads(text: &str) -> Result<NonZeroUsize, String> {
-    count::<MOST_THREADS>(text)
+    count::<MAX_THREADS>(text)
 }
 
 /// Parses a number from 1 to `MOST`.
@@ -51,7 +51,7 @@ pub fn duration(text: &str) -> Result<Duration, String> {
         (None, Some(number)) => number.trim().parse::<f64>().ok(),
         (None, None) => None,
     };
-    let seconds = seconds.filter(|s| *s > 0.0 && *s <= MOST_SECONDS);
+    let seconds = seconds.filter(|s| *s > 0.0 && *s <= MAX_SECONDS);
     seconds
         .map(Duration::from_secs_f64)
         .ok_or_else(|| format!("found {text}, expected a time above 0, at most an hour, such as 1s or 500ms"))

@@ -276,7 +276,7 @@ mod tests {
 
     #[cfg(feature = "experience")]
     #[test]
-    fn addresses_on_the_command_line_are_shown_without_passwords() {
+    fn addresses_on_the_command_line_are_printed_without_passwords() {
         let of = |text: &str| addresses_of(text.split_whitespace().map(OsString::from));
         assert!(
             of("grasp propose --depth d.png --camera=c.json --box 1,2,3,4 --experiences a.db").is_empty()

@@ -221,7 +221,7 @@ mod tests {
     }
 
     #[test]
-    fn the_share_of_a_program_is_beside_its_folder() {
+    fn the_share_folder_of_a_program_is_beside_its_bin_folder() {
         let share = share_of(Path::new("/usr/local/bin/sixfold"));
         assert_eq!(share.as_deref(), Some(Path::new("/usr/local/share/sixfold")));
     }

@@ -17,7 +17,7 @@ const TEXT: f64 = 4.0 / 3.0;
 /// Images in a row.
 const COLUMNS: usize = 4;
 /// Rotation with which a continuous symmetry is shown, as a fraction of a full turn.
-const SOME_TURN: f64 = 0.3;
+const SHOWN_ROTATION: f64 = 0.3;
 
 /// A symmetry as JSON has it; lengths in metres.
 #[derive(Debug, Serialize)]
@@ -114,9 +114,9 @@ pub fn picture(mesh: &Mesh, found: &[FoundSymmetry]) -> RgbImage {
     let mut images = vec![("as it is".to_owned(), portrait(mesh))];
     for s in found {
         let first = s.poses().first().copied();
-        let turn = first.or_else(|| s.continuous().map(|c| c.rotation(SOME_TURN * TAU)));
+        let turn = first.or_else(|| s.continuous().map(|c| c.rotation(SHOWN_ROTATION * TAU)));
         let rotated = mesh.transformed(&turn.unwrap_or_else(Pose::identity));
-        let degrees = 360.0 * s.order.map_or(SOME_TURN, |n| 1.0 / f64::from(n));
+        let degrees = 360.0 * s.order.map_or(SHOWN_ROTATION, |n| 1.0 / f64::from(n));
         let [x, y, z] = <[f64; 3]>::from(s.axis).map(|c| rounded(c, 2));
         let colors = s.color.map_or(String::new(), |_| format!(", colours {}", s.by_shape_and_color.name()));
         let caption = format!("{degrees:.0} degrees about {x} {y} {z}: shape {}{colors}", s.by_shape.name());

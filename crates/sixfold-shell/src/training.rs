@@ -35,7 +35,7 @@ pub struct MaterialArguments {
     /// Frames of the split to use as photographs: JSON, [{"scene_id": 2, "im_id": 36}, ...] (default: all)
     #[arg(long, value_name = "FILE", requires = "dataset", conflicts_with = "objects")]
     pub frames: Option<PathBuf>,
-    /// Open no photograph, learn from renders of the dataset's models alone
+    /// Train only on renders of the dataset's models, without photographs
     #[arg(long, requires = "dataset", conflicts_with_all = ["frames", "objects"])]
     pub renders_only: bool,
     /// Object ids of the dataset (default: all)
@@ -44,7 +44,7 @@ pub struct MaterialArguments {
     /// Objects to learn from renders: mesh files, or names given with `sixfold object add`; they get the ids 1, 2, ...
     #[arg(long = "object", value_name = "NAME_OR_MESH", num_args = 1.., conflicts_with = "dataset")]
     pub objects: Vec<String>,
-    /// Unit of mesh files: m, cm, mm, in (meshes in the store know theirs)
+    /// Unit of mesh files: m, cm, mm, in (not needed for stored objects)
     #[arg(long, value_name = "UNIT")]
     pub unit: Option<Unit>,
     /// Folder of photographs for backgrounds (default: procedural textures)

@@ -205,7 +205,7 @@ mod tests {
     }
 
     #[test]
-    fn what_has_no_volume_is_refused() {
+    fn meshes_without_volume_are_refused() {
         let points = Mesh::new(vec![Vec3::x(), Vec3::y(), Vec3::z()], vec![]).unwrap();
         let error = ConvexParts::of_mesh(&points, &PartsOptions::default()).unwrap_err().to_string();
         assert!(error.contains("0 faces") && error.contains("mesh with faces"), "{error}");

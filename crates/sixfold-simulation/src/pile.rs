@@ -68,7 +68,7 @@ struct Dropped {
     parts: ConvexParts,
     rotation: UnitQuaternion<f64>,
     /// Centre of its bounding box in its own frame, and the largest distance of a vertex from there.
-    middle: Vec3,
+    centre: Vec3,
     radius: f64,
     /// Largest distance of a vertex from the vertical axis through the centre, in its initial rotation.
     width: f64,
@@ -82,17 +82,17 @@ impl Dropped {
         let corners = || parts.parts().iter().flatten();
         let low = corners().fold(Vec3::repeat(f64::INFINITY), |low, c| low.inf(c));
         let high = corners().fold(Vec3::repeat(f64::NEG_INFINITY), |high, c| high.sup(c));
-        let middle = (low + high) * 0.5;
-        let radius = corners().map(|c| (c - middle).norm()).fold(0.0, f64::max);
-        let turned = || corners().map(|c| rotation * (c - middle));
-        let width = turned().map(|c| c.xy().norm()).fold(0.0, f64::max);
-        let below = turned().map(|c| -c.z).fold(0.0, f64::max);
-        Dropped { number, upright, parts, rotation, middle, radius, width, below }
+        let centre = (low + high) * 0.5;
+        let radius = corners().map(|c| (c - centre).norm()).fold(0.0, f64::max);
+        let rotated = || corners().map(|c| rotation * (c - centre));
+        let width = rotated().map(|c| c.xy().norm()).fold(0.0, f64::max);
+        let below = rotated().map(|c| -c.z).fold(0.0, f64::max);
+        Dropped { number, upright, parts, rotation, centre, radius, width, below }
     }
 
     /// Its pose when its centre is at `place` in the world.
     fn at(&self, place: &Vec3) -> Pose {
-        Pose::new(self.rotation, place - self.rotation * self.middle)
+        Pose::new(self.rotation, place - self.rotation * self.centre)
     }
 }
 
@@ -133,7 +133,7 @@ pub fn drop_objects(
         falling.push((body, object));
     }
     let mut last: Vec<Option<Pose>> = vec![None; parts.len()];
-    for look in 0..PATIENCE.1 {
+    for iteration in 0..PATIENCE.1 {
         for _ in 0..STEPS {
             world.step();
         }
@@ -141,13 +141,13 @@ pub fn drop_objects(
         let mut kept = vec![];
         for (body, object) in falling {
             let pose = body_pose(&world, body);
-            let middle = pose.transform_point(&object.middle);
+            let centre = pose.transform_point(&object.centre);
             let rests = last[object.number]
                 .is_some_and(|l| l.distance_to(&pose) < REST.0 && l.rotation_angle_to(&pose) < REST.1);
             last[object.number] = Some(pose);
             // `!(a < b)` also removes objects whose position is NaN.
-            let away = !(middle.xy().norm() < options.reach) || middle.z < 0.0;
-            if away || (!rests && look == PATIENCE.0) {
+            let away = !(centre.xy().norm() < options.reach) || centre.z < 0.0;
+            if away || (!rests && iteration == PATIENCE.0) {
                 world.remove_body(body);
                 all_rest = false;
                 continue;

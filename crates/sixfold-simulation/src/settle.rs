@@ -41,8 +41,8 @@ pub(crate) fn settle(parts: &ConvexParts, world_from_object: &Pose) -> Option<Po
 pub fn settle_at_centre(mesh: &Mesh, parts: &ConvexParts, world_from_object: &Pose) -> Option<Pose> {
     let rest = settle(parts, world_from_object)?;
     let (low, high) = mesh.transformed(&rest).bounding_box();
-    let middle = (low + high) * 0.5;
-    Some(rest.with_translation(rest.translation() - Vec3::new(middle.x, middle.y, 0.0)))
+    let centre = (low + high) * 0.5;
+    Some(rest.with_translation(rest.translation() - Vec3::new(centre.x, centre.y, 0.0)))
 }
 
 #[cfg(test)]

@@ -15,9 +15,9 @@ pub fn wilson_interval_of_fraction(share: f64, trials: usize) -> (f64, f64) {
     }
     let n = trials as f64;
     let p = share;
-    let middle = (p + Z * Z / (2.0 * n)) / (1.0 + Z * Z / n);
+    let centre = (p + Z * Z / (2.0 * n)) / (1.0 + Z * Z / n);
     let half = Z / (1.0 + Z * Z / n) * (p * (1.0 - p) / n + Z * Z / (4.0 * n * n)).sqrt();
-    ((middle - half).max(0.0), (middle + half).min(1.0))
+    ((centre - half).max(0.0), (centre + half).min(1.0))
 }
 
 #[cfg(test)]

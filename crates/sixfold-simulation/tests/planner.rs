@@ -16,7 +16,7 @@ fn hand() -> Gripper {
     Gripper::built_in("jaws-140").unwrap()
 }
 
-fn look(mesh: &Mesh, pose: &Pose) -> SimulatedView {
+fn simulated(mesh: &Mesh, pose: &Pose) -> SimulatedView {
     let point = ViewPoint { azimuth: 0.3, elevation: 0.8, distance: 0.85, target: Vec3::new(0.0, 0.0, 0.05) };
     simulate_view(mesh, pose, &point, Some(&DepthSensor::kinect()), 3).unwrap()
 }
@@ -28,7 +28,7 @@ fn view_of(seen: &SimulatedView) -> GraspView {
 }
 
 #[test]
-fn most_first_proposals_on_simple_shapes_are_held() {
+fn most_first_proposals_on_simple_shapes_hold() {
     let shapes = [
         shapes::cuboid(Vec3::new(0.06, 0.1, 0.12)).unwrap(),
         shapes::cylinder(0.035, 0.1).unwrap(),
@@ -48,8 +48,8 @@ fn most_first_proposals_on_simple_shapes_are_held() {
 }
 
 #[test]
-fn the_far_side_of_a_can_is_assumed_where_it_is() {
-    let seen = look(&shapes::cylinder(0.035, 0.1).unwrap(), &Pose::identity());
+fn the_far_side_of_a_can_is_completed_at_its_place() {
+    let seen = simulated(&shapes::cylinder(0.035, 0.1).unwrap(), &Pose::identity());
     let view = view_of(&seen);
     let whole = complete_by_mirrors(&view, &CompletionOptions::default());
     assert_eq!(whole.planes.len(), 2);
@@ -65,8 +65,8 @@ fn the_far_side_of_a_can_is_assumed_where_it_is() {
 }
 
 #[test]
-fn every_grasp_fits_the_gripper_and_stands_clear_of_the_table() {
-    let seen = look(&shapes::cup(0.04, 0.1, 0.004).unwrap(), &Pose::identity());
+fn every_grasp_fits_the_gripper_and_is_clear_of_the_table() {
+    let seen = simulated(&shapes::cup(0.04, 0.1, 0.004).unwrap(), &Pose::identity());
     let view = view_of(&seen);
     let gripper = hand();
     let grasps = antipodal_grasps(&view, &gripper, &AntipodalOptions::default()).unwrap();
@@ -92,7 +92,7 @@ fn every_grasp_fits_the_gripper_and_stands_clear_of_the_table() {
 
 #[test]
 fn an_object_wider_than_the_gripper_gives_no_grasp_across_it() {
-    let seen = look(&shapes::cuboid(Vec3::new(0.12, 0.12, 0.1)).unwrap(), &lifted(0.05));
+    let seen = simulated(&shapes::cuboid(Vec3::new(0.12, 0.12, 0.1)).unwrap(), &lifted(0.05));
     let narrow = Gripper::built_in("jaws-85").unwrap();
     assert!(antipodal_grasps(&view_of(&seen), &narrow, &AntipodalOptions::default()).unwrap().is_empty());
     let none = AntipodalOptions { samples: 0, ..AntipodalOptions::default() };
@@ -105,8 +105,8 @@ fn lifted(height: f64) -> Pose {
 }
 
 #[test]
-fn what_shows_no_object_is_refused_with_a_reason() {
-    let seen = look(&shapes::cylinder(0.035, 0.1).unwrap(), &Pose::identity());
+fn views_without_an_object_are_refused_with_a_reason() {
+    let seen = simulated(&shapes::cylinder(0.035, 0.1).unwrap(), &Pose::identity());
     let (depth, camera) = (&seen.depth, &seen.camera);
     let options = ViewOptions::default();
     let refused =
@@ -129,7 +129,7 @@ fn what_shows_no_object_is_refused_with_a_reason() {
         shapes::cylinder(0.03, 0.1).unwrap(),
         shapes::cylinder(0.03, 0.1).unwrap().transformed(&Pose::from_translation(Vec3::new(0.0, 0.2, 0.0))),
     ]);
-    let seen = look(&two.unwrap(), &Pose::identity());
+    let seen = simulated(&two.unwrap(), &Pose::identity());
     let error = GraspView::new(&seen.depth, &seen.camera, &full(true), &options).unwrap_err();
     assert!(matches!(error, ViewError::SeveralObjects { parts: 2, .. }), "{error}");
     assert_eq!(find_objects(&seen.depth, &seen.camera, &options).unwrap().len(), 2);
@@ -152,8 +152,8 @@ fn what_shows_no_object_is_refused_with_a_reason() {
 #[test]
 fn an_object_at_the_edge_of_the_image_is_marked_as_cut() {
     let seen =
-        look(&shapes::cylinder(0.035, 0.1).unwrap(), &Pose::from_translation(Vec3::new(0.0, 0.45, 0.0)));
+        simulated(&shapes::cylinder(0.035, 0.1).unwrap(), &Pose::from_translation(Vec3::new(0.0, 0.45, 0.0)));
     assert!(view_of(&seen).cut_by_edge);
-    let seen = look(&shapes::cylinder(0.035, 0.1).unwrap(), &Pose::identity());
+    let seen = simulated(&shapes::cylinder(0.035, 0.1).unwrap(), &Pose::identity());
     assert!(!view_of(&seen).cut_by_edge);
 }

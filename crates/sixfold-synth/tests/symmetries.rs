@@ -11,7 +11,7 @@ fn degrees(a: &Vec3, b: &Vec3) -> f64 {
 }
 
 #[test]
-fn families_have_the_symmetries_of_their_making() {
+fn families_have_the_symmetries_of_their_construction() {
     for family in Family::ALL {
         for number in 0..3 {
             let member = member(family, &mut stream(5, number)).unwrap();

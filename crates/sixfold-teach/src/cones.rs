@@ -51,9 +51,10 @@ impl<'a> Ready<'a> {
     fn new(cone: &Cone<'a>) -> Option<Ready<'a>> {
         let [x, y, width, height] = cone.mask.bounding_box()?;
         let camera = cone.camera.without_distortion();
-        let middle = Vec2::new(x as f64 + 0.5 * width as f64 - 0.5, y as f64 + 0.5 * height as f64 - 0.5);
+        let box_centre = Vec2::new(x as f64 + 0.5 * width as f64 - 0.5, y as f64 + 0.5 * height as f64 - 0.5);
         let world_from_camera = cone.camera_from_world.inverse();
-        let direction = world_from_camera.transform_direction(&camera.unproject(&middle, 1.0)).normalize();
+        let direction =
+            world_from_camera.transform_direction(&camera.unproject(&box_centre, 1.0)).normalize();
         let half = 0.5 * (width as f64).hypot(height as f64) / camera.fx;
         let possible = match cone.unknown {
             Some(unknown) if unknown.size() == cone.mask.size() => {
@@ -216,7 +217,7 @@ mod tests {
     }
 
     #[test]
-    fn one_direction_or_masks_apart_give_none() {
+    fn one_direction_or_disjoint_masks_give_none() {
         let pose = looking_at(&Vec3::zeros(), 10.0, 30.0, 0.5, 0.0);
         let mask = ball(&Vec3::zeros(), &pose);
         assert!(volume(&[pose, pose], &[mask.clone(), mask.clone()], &[None, None]).is_none());

@@ -15,27 +15,29 @@ use thiserror::Error;
 pub enum TeachError {
     /// Too few photographs.
     #[error(
-        "found {found} photographs that can be used, expected at least {least}: take 8 to 40 from all sides, the board in sight\
+        "found {found} photographs that can be used, expected at least {minimum}: take 8 to 40 from all \
+         sides, the board in sight\
          {reasons}"
     )]
     TooFewPhotographs {
         /// How many can be used.
         found: usize,
         /// How many are needed.
-        least: usize,
+        minimum: usize,
         /// Why the others cannot; empty or `; FILE: REASON; ...`.
         reasons: String,
     },
     /// All photographs are from one side.
     #[error(
-        "all photographs are taken from within {degrees:.0} degrees: walk around the object, expected at least {least:.0} degrees \
+        "all photographs are taken from within {degrees:.0} degrees: walk around the object, expected at \
+         least {minimum:.0} degrees \
          between two of them"
     )]
     OneSide {
         /// The largest angle between two of them.
         degrees: f64,
         /// What is needed.
-        least: f64,
+        minimum: f64,
     },
     /// No photograph shows the board.
     #[error(
@@ -75,14 +77,15 @@ pub enum TeachError {
     NoPhotographs,
     /// Photographs without a board that cannot be registered to each other.
     #[error(
-        "{found} photographs show enough of the same, expected at least {least}: take 16 to 40 in steps of at most 20 degrees around \
+        "{found} photographs show enough of the same, expected at least {minimum}: take 16 to 40 in steps \
+         of at most 20 degrees around \
          the object, sharp, on a ground with much texture (newspaper, a patterned cloth) that stays in place{reasons}"
     )]
     NotTogether {
         /// How many match each other.
         found: usize,
         /// How many are needed.
-        least: usize,
+        minimum: usize,
         /// Why the others do not; empty or `; FILE: REASON; ...`.
         reasons: String,
     },
@@ -91,20 +94,21 @@ pub enum TeachError {
     Sfm(#[source] SfmError),
     /// Without a board the scale in metres is unknown.
     #[error(
-        "photographs without a board do not show how large things are: give the length between two points that you marked in \
+        "photographs without a board do not determine the scale: give the length between two points that \
+         you marked in \
          two or more photographs (--length 0.12 --ends PHOTOGRAPH:X,Y:X,Y), or depth images"
     )]
     NoScale,
     /// Depth images from which the scale cannot be computed.
     #[error(
-        "{found} features of the photographs have a measured depth, expected at least {least}: check --depth-scale and whether depth \
-         images are from the same places, or give --length and --ends"
+        "{found} features of the photographs have a measured depth, expected at least {minimum}: check \
+         --depth-scale and whether depth images are from the same viewpoints, or give --length and --ends"
     )]
     FewDepths {
         /// Number of features with a measured depth.
         found: usize,
         /// How many are needed.
-        least: usize,
+        minimum: usize,
     },
     /// Marked points that give no length.
     #[error("--ends: {what}")]
@@ -136,8 +140,9 @@ pub enum TeachError {
     },
     /// Masks of photographs contradict each other.
     #[error(
-        "the masks of {contradicting} of {all} photographs contradict the others: transparent and mirroring objects cannot be taught \
-         from photographs, nor what moved between them; correct the masks, or give a mesh"
+        "the masks of {contradicting} of {all} photographs contradict the others: objects that are \
+         transparent or mirroring, or that moved between photographs, cannot be taught; correct the masks, \
+         or give a mesh"
     )]
     Contradicting {
         /// Number of contradicting masks.

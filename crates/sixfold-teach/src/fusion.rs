@@ -11,15 +11,15 @@ use crate::view::View;
 const SMOOTH: f64 = 1.2;
 
 /// Carves from a hull the space that depth shows to be empty. A measurement counts up to `reach` metres behind the measured
-/// surface; at least `least` views have to agree.
-pub(crate) fn carved(hull: &Grid, views: &[View], depths: &[DepthImage], reach: f64, least: f32) -> Grid {
+/// surface; at least `minimum` views have to agree.
+pub(crate) fn carved(hull: &Grid, views: &[View], depths: &[DepthImage], reach: f64, minimum: f32) -> Grid {
     let mut carved = hull.clone();
     carved.values.par_iter_mut().enumerate().for_each(|(index, value)| {
         // This point is far outside already.
         if f64::from(*value) > reach {
             return;
         }
-        if let Some(distance) = distance(&hull.point(hull.place(index)), views, depths, reach, least) {
+        if let Some(distance) = distance(&hull.point(hull.place(index)), views, depths, reach, minimum) {
             *value = value.max(distance);
         }
     });
@@ -33,7 +33,7 @@ pub(crate) fn carved(hull: &Grid, views: &[View], depths: &[DepthImage], reach: 
 
 /// How far a point is in front of the measured surface, metres, limited to `reach` in both directions; `None` if too few
 /// views have a measurement.
-fn distance(point: &Vec3, views: &[View], depths: &[DepthImage], reach: f64, least: f32) -> Option<f32> {
+fn distance(point: &Vec3, views: &[View], depths: &[DepthImage], reach: f64, minimum: f32) -> Option<f32> {
     let (mut sum, mut weight) = (0.0, 0.0);
     for (view, depth) in views.iter().zip(depths) {
         let Some((pixel, z)) = view.project(point) else { continue };
@@ -44,5 +44,5 @@ fn distance(point: &Vec3, views: &[View], depths: &[DepthImage], reach: f64, lea
         sum += (measured - z).min(reach) as f32;
         weight += 1.0;
     }
-    (weight >= least).then(|| sum / weight)
+    (weight >= minimum).then(|| sum / weight)
 }

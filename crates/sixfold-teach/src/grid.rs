@@ -148,10 +148,10 @@ mod tests {
     #[test]
     fn smoothing_keeps_a_plane_and_dampens_a_peak() {
         let mut grid = ball(0.5);
-        let middle = grid.index([10, 10, 10]);
-        grid.values[middle] = 5.0;
+        let central = grid.index([10, 10, 10]);
+        grid.values[central] = 5.0;
         let smooth = grid.smoothed(1.0);
-        assert!(smooth.values[middle] < 1.0);
+        assert!(smooth.values[central] < 1.0);
         let plane =
             Grid { values: (0..grid.values.len()).map(|i| grid.place(i)[0] as f32).collect(), ..grid };
         let at = plane.index([9, 4, 4]);

@@ -91,13 +91,13 @@ mod tests {
     #[test]
     fn one_narrow_mask_cuts_and_one_hole_alone_does_not() {
         let mut masks = vec![square(20.0, false); ONE_MAY_BE_WRONG];
-        let (beside, middle) = (Vec3::new(0.015, 0.0, 0.0), Vec3::zeros());
-        assert!(at(&masks, beside) < -0.003 && at(&masks, middle) < -0.015);
+        let (beside, centre) = (Vec3::new(0.015, 0.0, 0.0), Vec3::zeros());
+        assert!(at(&masks, beside) < -0.003 && at(&masks, centre) < -0.015);
         masks[3] = square(10.0, false);
-        assert!(at(&masks, beside) > 0.003, "15 mm from the middle is 5 mm outside the narrow mask");
+        assert!(at(&masks, beside) > 0.003, "15 mm from the centre is 5 mm outside the narrow mask");
         masks[3] = square(20.0, true);
-        assert!(at(&masks, middle) < -0.015, "a hole in one mask is none");
+        assert!(at(&masks, centre) < -0.015, "a hole in one mask is none");
         masks[7] = square(20.0, true);
-        assert!(at(&masks, middle) > 0.003, "a hole in two masks is one");
+        assert!(at(&masks, centre) > 0.003, "a hole in two masks is one");
     }
 }

@@ -49,6 +49,6 @@ pub use shape::{
 };
 pub use silhouette::{SalientSegmenter, Segmenter};
 pub use snapshot::Snapshot;
-pub use teaching::{By, MOST_PHOTOGRAPHS, Photograph, ShapeFacts, TeachOptions, Teaching, World};
+pub use teaching::{By, MAX_PHOTOGRAPHS, Photograph, ShapeFacts, TeachOptions, Teaching, World};
 pub use unboarded::{DepthOf, KnownLength, PutTogether, SeenFeatures, features_of, put_together};
 pub use view::{PosedPhotograph, Volume};

@@ -24,16 +24,16 @@ pub(crate) fn finer(mesh: &Mesh, most: usize) -> Mesh {
     let mut mesh = mesh.clone();
     while !mesh.faces().is_empty() && 4 * mesh.faces().len() <= most {
         let mut vertices = mesh.vertices().to_vec();
-        let mut middles = std::collections::BTreeMap::new();
-        let mut middle = |a: u32, b: u32| {
-            *middles.entry((a.min(b), a.max(b))).or_insert_with(|| {
+        let mut midpoints = std::collections::BTreeMap::new();
+        let mut midpoint = |a: u32, b: u32| {
+            *midpoints.entry((a.min(b), a.max(b))).or_insert_with(|| {
                 vertices.push(0.5 * (vertices[a as usize] + vertices[b as usize]));
                 vertices.len() as u32 - 1
             })
         };
         let mut faces = Vec::with_capacity(4 * mesh.faces().len());
         for &[a, b, c] in mesh.faces() {
-            let [ab, bc, ca] = [middle(a, b), middle(b, c), middle(c, a)];
+            let [ab, bc, ca] = [midpoint(a, b), midpoint(b, c), midpoint(c, a)];
             faces.extend([[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]]);
         }
         let Ok(cut) = Mesh::new(vertices, faces) else { return mesh };
@@ -63,7 +63,7 @@ pub(crate) fn painted(mesh: &Mesh, views: &[View]) -> Painted {
                     seen.push((cosine * cosine, bilinear_rgb(&view.image, pixel.x, pixel.y)));
                 }
             }
-            middle_color(&seen)
+            median_color(&seen)
         })
         .collect();
     let unseen = unseen_fraction(mesh, &colors);
@@ -71,7 +71,7 @@ pub(crate) fn painted(mesh: &Mesh, views: &[View]) -> Painted {
 }
 
 /// The weighted median of each channel, which is robust to moving highlights and to single wrong photographs.
-fn middle_color(seen: &[(f64, [f64; 3])]) -> Option<[u8; 3]> {
+fn median_color(seen: &[(f64, [f64; 3])]) -> Option<[u8; 3]> {
     let total: f64 = seen.iter().map(|s| s.0).sum();
     if seen.is_empty() {
         return None;
@@ -80,11 +80,11 @@ fn middle_color(seen: &[(f64, [f64; 3])]) -> Option<[u8; 3]> {
         let mut values: Vec<(f64, f64)> = seen.iter().map(|(weight, color)| (color[c], *weight)).collect();
         values.sort_by(|a, b| a.0.total_cmp(&b.0));
         let mut sum = 0.0;
-        let middle = values.iter().find(|(_, weight)| {
+        let weighted_median = values.iter().find(|(_, weight)| {
             sum += weight;
             sum >= 0.5 * total
         });
-        middle.or(values.last()).map_or(0, |(value, _)| value.round() as u8)
+        weighted_median.or(values.last()).map_or(0, |(value, _)| value.round() as u8)
     }))
 }
 

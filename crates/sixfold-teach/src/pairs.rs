@@ -31,7 +31,8 @@ pub fn pose_of_points(
         return Err(refused("found a number that is not finite, expected metres and pixels".to_owned()));
     }
     let nothing = || {
-        let what = "no camera sees these points there: expected points that are not on one line, each at its own pixel";
+        let what = "no pose explains these points: expected points that are not collinear, each at its own \
+             pixel";
         refused(what.to_owned())
     };
     let ([a, b, c], [u, v, w]) = (points, pixels) else {

@@ -90,9 +90,9 @@ fn cloud(mesh: &Mesh, seed: u64) -> PointCloud {
 fn aligned(given: &Mesh, hull: &Mesh) -> Vec<Pose> {
     let diameter = given.diameter();
     let (source, target) = (cloud(given, 1), cloud(hull, 2));
-    let (own_tree, middle) = (KdTree::new(&source.points), middle_of(given));
+    let (own_tree, given_centre) = (KdTree::new(&source.points), centre_of(given));
     let Ok(target) = IndexedCloud::new(target) else { return vec![] };
-    let there = middle_of(hull);
+    let there = centre_of(hull);
     let options = IcpOptions {
         levels: vec![
             IcpLevel { rejection_distance: 0.4 * diameter, iterations: 8, stride: 2 },
@@ -104,7 +104,7 @@ fn aligned(given: &Mesh, hull: &Mesh) -> Vec<Pose> {
     let mut all: Vec<(f64, Pose)> = rotations()
         .into_par_iter()
         .map(|rotation| {
-            let start = Pose::new(rotation, there - rotation * middle);
+            let start = Pose::new(rotation, there - rotation * given_centre);
             let pose = icp(&source, &target, &start, &options).map_or(start, |r| r.target_from_source);
             let back = pose.inverse();
             let near = |tree: &KdTree, p: &Vec3| tree.nearest(p).map_or(diameter, |n| n.distance);
@@ -153,7 +153,7 @@ fn rotations() -> Vec<UnitQuaternion<f64>> {
     all
 }
 
-fn middle_of(mesh: &Mesh) -> Vec3 {
+fn centre_of(mesh: &Mesh) -> Vec3 {
     let (low, high) = mesh.bounding_box();
     0.5 * (low + high)
 }
@@ -222,9 +222,12 @@ impl Fit<'_> {
         let mut twist = Vector6::zeros();
         twist[axis] = by;
         let step = Pose::exp(&twist);
-        let middle = pose.transform_point(&middle_of(&self.mesh));
-        let shifted = pose.translation() - middle;
-        Pose::new(step.rotation() * pose.rotation(), step.rotation() * shifted + middle + step.translation())
+        let mesh_centre = pose.transform_point(&centre_of(&self.mesh));
+        let shifted = pose.translation() - mesh_centre;
+        Pose::new(
+            step.rotation() * pose.rotation(),
+            step.rotation() * shifted + mesh_centre + step.translation(),
+        )
     }
 
     /// Agreement of the mesh's own colours with the photographs: mean correlation over the views; 0 for a mesh without colours.

@@ -206,9 +206,9 @@ fn with_depth(capture: &Capture) -> bool {
 
 fn check_count(capture: &Capture) -> Result<(), TeachError> {
     let found = capture.photographs.len();
-    let least = if with_depth(capture) { FEWEST_WITH_DEPTH } else { FEWEST_PHOTOGRAPHS };
-    if found < least {
-        return Err(TeachError::TooFewPhotographs { found, least, reasons: String::new() });
+    let minimum = if with_depth(capture) { FEWEST_WITH_DEPTH } else { FEWEST_PHOTOGRAPHS };
+    if found < minimum {
+        return Err(TeachError::TooFewPhotographs { found, minimum, reasons: String::new() });
     }
     Ok(())
 }
@@ -227,7 +227,7 @@ fn check_photographs(capture: &Capture, searched: &Volume) -> Result<(), TeachEr
     let angle = |a: &Vec3, b: &Vec3| a.dot(b).clamp(-1.0, 1.0).acos().to_degrees();
     let largest = towards.iter().flat_map(|a| towards.iter().map(move |b| angle(a, b))).fold(0.0, f64::max);
     if largest < APART {
-        return Err(TeachError::OneSide { degrees: largest, least: APART });
+        return Err(TeachError::OneSide { degrees: largest, minimum: APART });
     }
     Ok(())
 }
@@ -261,9 +261,9 @@ fn rough_volume(
 ) -> Result<Volume, TeachError> {
     let all: Vec<usize> = (0..capture.photographs.len()).collect();
     let views = views_of(capture, searched, options.coarse_side, &all);
-    let least = if with_depth(capture) { 1 } else { FEWEST_PHOTOGRAPHS };
-    if views.len() < least {
-        return Err(TeachError::TooFewPhotographs { found: views.len(), least, reasons: String::new() });
+    let minimum = if with_depth(capture) { 1 } else { FEWEST_PHOTOGRAPHS };
+    if views.len() < minimum {
+        return Err(TeachError::TooFewPhotographs { found: views.len(), minimum, reasons: String::new() });
     }
     let views = with_cues(views, capture, segmenter, progress, 0)?;
     let odds: Vec<(View, Image<f32>)> = views.into_iter().map(|(_, v, c)| (v, c.sum())).collect();
@@ -437,7 +437,7 @@ pub fn reconstruct(
     let (fine, with_depth) = match depth_of(capture, &used, &found.volume, &fine, found, options) {
         Some(known) => {
             step(progress, 2, SHAPE_STEPS)?;
-            (carved(&fine, &known.views, &known.depths, 3.0 * fine.step, known.least), known.fraction)
+            (carved(&fine, &known.views, &known.depths, 3.0 * fine.step, known.minimum), known.fraction)
         }
         None => (fine, 0.0),
     };
@@ -506,7 +506,7 @@ struct KnownDepth {
     views: Vec<View>,
     depths: Vec<DepthImage>,
     /// How many views have to agree that a place is empty.
-    least: f32,
+    minimum: f32,
     /// Fraction of the masks' pixels that have depth.
     fraction: f64,
 }
@@ -550,8 +550,8 @@ fn depth_of(
         .collect();
     let pixels = masks.iter().map(|m| m.as_slice().iter().filter(|v| **v).count()).sum::<usize>();
     let known = depths.iter().map(|d| d.as_slice().iter().filter(|v| **v > 0.0).count()).sum::<usize>();
-    let least = if measured { 1.0 } else { 3.0 };
-    Some(KnownDepth { views, depths, least, fraction: known as f64 / pixels.max(1) as f64 })
+    let minimum = if measured { 1.0 } else { 3.0 };
+    Some(KnownDepth { views, depths, minimum, fraction: known as f64 / pixels.max(1) as f64 })
 }
 
 /// The depths at which the rays of a view's pixels enter a closed mesh and first leave it again, with a margin.

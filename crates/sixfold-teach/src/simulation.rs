@@ -103,8 +103,8 @@ impl<'a> SimulatedCapture<'a> {
         let mut random = stream(seed, 0);
         let angle = f64::from(uniform(&mut random, [0.0, std::f32::consts::TAU]));
         let rotation = UnitQuaternion::from_axis_angle(&Vec3::z_axis(), angle);
-        let middle = Vec3::new(0.5 * (low.x + high.x), 0.5 * (low.y + high.y), low.z);
-        let board_from_object = Pose::new(rotation, -(rotation * middle));
+        let base_centre = Vec3::new(0.5 * (low.x + high.x), 0.5 * (low.y + high.y), low.z);
+        let board_from_object = Pose::new(rotation, -(rotation * base_centre));
         let target = Vec3::new(0.0, 0.0, 0.4 * (high.z - low.z));
         let pose = |i: usize| {
             let mut random = stream(seed, 1 + i as u64);

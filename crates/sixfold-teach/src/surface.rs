@@ -176,7 +176,7 @@ mod tests {
     }
 
     #[test]
-    fn what_reaches_the_border_is_closed_there() {
+    fn surfaces_at_the_border_are_closed() {
         let volume = Volume { low: Vec3::repeat(-1.0), high: Vec3::repeat(1.0) };
         let mesh = surface(&Grid::new(&volume, 10, |_| -1.0)).unwrap();
         assert!(edges(&mesh).values().all(|n| *n == 0));

@@ -33,7 +33,7 @@ use crate::snapshot::{Snapshot, State, VERSION};
 use crate::view::Volume;
 
 /// Maximum number of photographs.
-pub const MOST_PHOTOGRAPHS: usize = 200;
+pub const MAX_PHOTOGRAPHS: usize = 200;
 /// The file of a mesh that was given.
 const GIVEN_MESH: &str = "given.ply";
 
@@ -222,9 +222,9 @@ impl Teaching {
         let png = bytes.starts_with(b"\x89PNG");
         let there = self.known.state.photographs.iter().position(|p| p.name == name);
         let number = there.unwrap_or(self.known.state.photographs.len());
-        if number >= MOST_PHOTOGRAPHS {
+        if number >= MAX_PHOTOGRAPHS {
             let what = format!(
-                "expected at most {MOST_PHOTOGRAPHS} photographs; leave out those that show nothing new"
+                "expected at most {MAX_PHOTOGRAPHS} photographs; leave out those that show nothing new"
             );
             return Err(TeachError::File { path: PathBuf::from(name), what });
         }
@@ -322,7 +322,7 @@ impl Teaching {
         }
         if self.known.state.photographs.iter().all(|p| p.left_out.is_some()) {
             let found =
-                TeachError::TooFewPhotographs { found: 0, least: self.fewest(), reasons: String::new() };
+                TeachError::TooFewPhotographs { found: 0, minimum: self.fewest(), reasons: String::new() };
             return Err(self.with_reasons(found));
         }
         self.known.state.located = Some((None, camera, 0.0));
@@ -405,13 +405,13 @@ impl Teaching {
     /// Adds the reasons why photographs are not used to an error about too few.
     fn with_reasons(&self, error: TeachError) -> TeachError {
         match error {
-            TeachError::TooFewPhotographs { found, least, .. } => {
+            TeachError::TooFewPhotographs { found, minimum, .. } => {
                 let all = self.known.state.photographs.iter();
                 let reasons: Vec<String> = all
                     .filter_map(|p| Some(format!("; {}: {}", p.name, p.left_out.as_ref()?)))
                     .take(5)
                     .collect();
-                TeachError::TooFewPhotographs { found, least, reasons: reasons.concat() }
+                TeachError::TooFewPhotographs { found, minimum, reasons: reasons.concat() }
             }
             other => other,
         }
@@ -440,12 +440,12 @@ impl Teaching {
                 None
             });
         }
-        let least = self.fewest();
+        let minimum = self.fewest();
         let found = masks.iter().flatten().count();
-        if found < least {
+        if found < minimum {
             return Err(self.with_reasons(TeachError::TooFewPhotographs {
                 found,
-                least,
+                minimum,
                 reasons: String::new(),
             }));
         }

@@ -24,7 +24,7 @@ const FEATURES: usize = 2048;
 /// between the sides of an object the ground rotates in the image.
 const ROTATIONS: [f64; 4] = [-90.0, -45.0, 45.0, 90.0];
 /// Smallest product of two descriptors that match, as in the authors' `match`.
-const LEAST_PRODUCT: f32 = 0.82;
+const MIN_PRODUCT: f32 = 0.82;
 /// Focal length if unknown, as a fraction of the image's longer side: between a phone (0.72) and a webcam (1.1).
 const FOCAL_LENGTH: f64 = 0.9;
 /// Largest distance of a marked point from its position according to the other photographs, as a fraction of the image's longer
@@ -198,7 +198,7 @@ fn scene_of(
     let features: Vec<Features> = seen.iter().map(usable).collect();
     let pairs = seen.len() * seen.len().saturating_sub(1) / 2;
     let total = 2 * pairs + seen.len();
-    let matches = matched(&features, LEAST_PRODUCT, &|done: usize, _: usize| progress.report(done, total))
+    let matches = matched(&features, MIN_PRODUCT, &|done: usize, _: usize| progress.report(done, total))
         .ok_or(TeachError::Stopped)?;
     let longest = size.0.max(size.1) as f64;
     let mut focal_lengths: Vec<f64> =
@@ -230,7 +230,7 @@ fn guessed((width, height): (usize, usize), focal_length: Option<f64>) -> Camera
 fn named(error: SfmError, seen: &[SeenFeatures], size: (usize, usize)) -> TeachError {
     match error {
         SfmError::Stopped => TeachError::Stopped,
-        SfmError::TooFew { found, least, left_out } => {
+        SfmError::TooFew { found, minimum, left_out } => {
             let name = |i: usize| seen[i].name.clone();
             let of = |(s, reason): (&SeenFeatures, Option<sixfold_sfm::LeftOut>)| {
                 let reason = if s.size == size { reason?.reason(&name) } else { other_size(s.size, size) };
@@ -241,7 +241,7 @@ fn named(error: SfmError, seen: &[SeenFeatures], size: (usize, usize)) -> TeachE
             if all.len() > 5 {
                 reasons.push_str(&format!("; and {} more", all.len() - 5));
             }
-            TeachError::NotTogether { found, least, reasons }
+            TeachError::NotTogether { found, minimum, reasons }
         }
         other => TeachError::Sfm(other),
     }
@@ -373,7 +373,7 @@ fn metres_of_depth(
     let count = ratios.len();
     match median(&mut ratios) {
         Some(metres) if count >= FEWEST_DEPTHS && metres > 0.0 => Ok(metres),
-        _ => Err(TeachError::FewDepths { found: count, least: FEWEST_DEPTHS }),
+        _ => Err(TeachError::FewDepths { found: count, minimum: FEWEST_DEPTHS }),
     }
 }
 
@@ -437,7 +437,7 @@ mod tests {
     }
 
     #[test]
-    fn a_length_between_marks_says_how_long_the_unit_is() {
+    fn a_length_between_marks_gives_the_scale() {
         let (mut scene, seen) = scene();
         let ends = [Vec3::new(0.1, 0.0, 0.0), Vec3::new(-0.1, 0.0, 0.0)];
         let length = marked_in(&scene, ends, &[0, 2]);
@@ -461,7 +461,7 @@ mod tests {
     }
 
     #[test]
-    fn depth_says_how_long_the_unit_is_but_for_borders_and_holes() {
+    fn depth_gives_the_scale_except_at_borders_and_holes() {
         let (scene, seen) = scene();
         // Depth of the patch at half the unit; every third pixel column is a hole, and a third of the image another surface.
         let depth_of = |i: usize| {

@@ -31,7 +31,7 @@ pub(crate) struct Upright {
 /// The upright frame from the points and cameras of a scene.
 pub(crate) fn upright(points: &[Vec3], camera_from_scene: &[Pose]) -> Upright {
     let eyes: Vec<Vec3> = camera_from_scene.iter().map(|p| p.inverse().translation()).collect();
-    let centre = meeting_point(camera_from_scene, &eyes).unwrap_or_else(|| middle(points));
+    let centre = meeting_point(camera_from_scene, &eyes).unwrap_or_else(|| centroid(points));
     let mut distances: Vec<f64> = eyes.iter().map(|e| (e - centre).norm()).collect();
     let distance = median(&mut distances).unwrap_or(1.0);
     let near: Vec<Vec3> =
@@ -54,7 +54,7 @@ pub(crate) fn upright(points: &[Vec3], camera_from_scene: &[Pose]) -> Upright {
     Upright { world_from_scene: Pose::new(rotation, -(rotation * origin)), on_table: table.is_some() }
 }
 
-fn middle(points: &[Vec3]) -> Vec3 {
+fn centroid(points: &[Vec3]) -> Vec3 {
     let of = |axis: usize| median(&mut points.iter().map(|p| p[axis]).collect::<Vec<f64>>()).unwrap_or(0.0);
     Vec3::new(of(0), of(1), of(2))
 }
@@ -88,7 +88,7 @@ fn meeting_point(poses: &[Pose], eyes: &[Vec3]) -> Option<Vec3> {
 /// The plane with the most points that has all cameras on one side and nothing on the other; its normal points to the cameras'
 /// side.
 fn table(points: &[Vec3], eyes: &[Vec3], thickness: f64) -> Option<Plane> {
-    let middle = eyes.iter().sum::<Vec3>() / eyes.len().max(1) as f64;
+    let centroid = eyes.iter().sum::<Vec3>() / eyes.len().max(1) as f64;
     let options = PlaneOptions {
         threshold: thickness,
         iterations: 1000,
@@ -98,12 +98,12 @@ fn table(points: &[Vec3], eyes: &[Vec3], thickness: f64) -> Option<Plane> {
     let mut left = points.to_vec();
     for seed in 0..TRIES as u64 {
         let cloud = PointCloud { points: left.clone(), normals: vec![] };
-        let found = dominant_plane(&cloud, &options, seed)?.facing(&middle);
+        let found = dominant_plane(&cloud, &options, seed)?.facing(&centroid);
         let below = points.iter().filter(|p| found.distance(p) < -3.0 * thickness).count();
         let held = points.iter().filter(|p| found.distance(p).abs() < thickness).count() as f64;
         let above = eyes.iter().all(|eye| found.distance(eye) > thickness);
         if above && below as f64 <= BELOW * points.len() as f64 && held >= ON_TABLE * points.len() as f64 {
-            return Some(fitted(found, points, &middle, thickness));
+            return Some(fitted(found, points, &centroid, thickness));
         }
         left.retain(|p| found.distance(p).abs() >= thickness);
     }
@@ -147,7 +147,7 @@ mod tests {
     }
 
     #[test]
-    fn the_frame_stands_on_the_table_wherever_the_reconstruction_lies() {
+    fn the_frame_is_on_the_table_for_any_frame_of_the_reconstruction() {
         let (points, poses) = scene();
         let scene_from_truth = Pose::exp(&[0.3, -2.0, 1.0, 1.0, -0.4, 2.0].into());
         let moved: Vec<Vec3> = points.iter().map(|p| scene_from_truth.transform_point(p)).collect();
@@ -161,7 +161,7 @@ mod tests {
     }
 
     #[test]
-    fn without_a_table_up_is_where_the_photographs_have_it() {
+    fn without_a_table_up_comes_from_the_photographs() {
         let (_, poses) = scene();
         let ball: Vec<Vec3> = (0..600)
             .map(|i| {

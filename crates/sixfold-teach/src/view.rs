@@ -6,7 +6,7 @@ use rayon::prelude::*;
 use sixfold_geometry::{Camera, DepthImage, Image, Mask, Pose, RgbImage, Vec2, Vec3};
 
 /// Maximum number of samples along a side of a pixel when a photograph is made smaller.
-const MOST_SAMPLES: f64 = 4.0;
+const MAX_SAMPLES: f64 = 4.0;
 
 /// A photograph with known camera and pose. The poses define the world frame: the board's, or an object's.
 #[derive(Debug, Clone)]
@@ -187,7 +187,7 @@ pub(crate) fn reduced(
     step: f64,
     source: &(impl Fn(f64, f64) -> Vec2 + Sync),
 ) -> RgbImage {
-    let samples = step.ceil().clamp(1.0, MOST_SAMPLES) as usize;
+    let samples = step.ceil().clamp(1.0, MAX_SAMPLES) as usize;
     let offset = |k: usize| (k as f64 + 0.5) / samples as f64 - 0.5;
     let pixel = |x: usize, y: usize| {
         let mut sum = [0.0; 3];

@@ -187,7 +187,7 @@ fn a_body_is_taught_stored_and_exported_and_a_second_run_does_nothing_again() {
 }
 
 #[test]
-fn corrections_are_kept_and_what_they_change_is_made_again() {
+fn corrections_are_kept_and_their_dependents_recomputed() {
     let truth = photographs();
     let dir = tempfile::tempdir().unwrap();
     let mut teaching = Teaching::open(
@@ -230,7 +230,7 @@ fn corrections_are_kept_and_what_they_change_is_made_again() {
 }
 
 #[test]
-fn a_correction_begins_again_only_what_it_changes_and_readers_see_it_all_the_time() {
+fn a_correction_recomputes_only_what_depends_on_it_while_readers_see_consistent_state() {
     let truth = photographs();
     let dir = tempfile::tempdir().unwrap();
     let salient = Salient::new();
@@ -285,7 +285,7 @@ fn posed(images: &[RgbImage], poses: &[Pose]) -> Vec<PosedPhotograph> {
 }
 
 #[test]
-fn photographs_that_teach_nothing_are_refused_with_what_to_do() {
+fn unusable_photographs_are_refused_with_advice() {
     let truth = photographs();
     let few = failure(posed(&truth.images[..3], &truth.camera_from_board));
     assert!(few.to_string().contains("found 3 photographs"), "{few}");
@@ -378,7 +378,7 @@ fn untextured(file_from_body: &Pose) -> Mesh {
 }
 
 #[test]
-fn a_mesh_that_is_there_already_is_laid_into_the_photographs_and_coloured_by_them() {
+fn a_given_mesh_is_aligned_with_the_photographs_and_coloured_from_them() {
     let photographs = photographs();
     let folder = tempfile::tempdir().unwrap();
     let twist = sixfold_geometry::nalgebra::Vector6::new(0.3, -0.1, 0.2, 0.9, -1.7, 0.4);
@@ -442,7 +442,7 @@ fn half_hidden() -> Vec<(Mask, Option<Mask>)> {
 }
 
 #[test]
-fn poses_and_masks_that_are_given_need_no_board_and_what_is_hidden_cuts_nothing() {
+fn given_poses_and_masks_need_no_board_and_occlusion_cuts_nothing() {
     let truth = photographs();
     let dir = tempfile::tempdir().unwrap();
     let options =

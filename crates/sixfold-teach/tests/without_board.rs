@@ -103,7 +103,7 @@ impl Taken {
 }
 
 #[test]
-fn poses_scale_and_floor_are_found_without_the_camera_and_what_cannot_be_is_said() {
+fn poses_scale_and_floor_are_found_without_the_camera_or_an_error_explains() {
     let mut taken = taken();
     // A photograph of another camera is left out, and the others are registered.
     taken.seen[4].size = (480, 640);
@@ -151,7 +151,7 @@ fn assert_refused(taken: Taken, length: &KnownLength) {
 }
 
 #[test]
-fn a_teaching_keeps_the_poses_and_forgets_them_for_another_length() {
+fn a_teaching_keeps_its_poses_until_the_length_changes() {
     let folder = tempfile::tempdir().unwrap();
     let options = SimulationOptions { photographs: 6, around: 120.0, ..few_pixels() };
     let (mesh, cloth, table) = (brick(), patterned(1024, 2), RgbImage::filled(8, 8, [110, 105, 95]));

@@ -24,16 +24,16 @@ impl Crop {
         if !(bbox.width > 0.0 && bbox.height > 0.0) {
             return None;
         }
-        let middle = Vec2::new(bbox.x + 0.5 * bbox.width, bbox.y + 0.5 * bbox.height);
+        let box_centre = Vec2::new(bbox.x + 0.5 * bbox.width, bbox.y + 0.5 * bbox.height);
         let ray = |x: f64, y: f64| camera.unproject(&Vec2::new(x, y), 1.0);
-        let to = Unit::try_new(ray(middle.x, middle.y), 1e-9)?;
+        let to = Unit::try_new(ray(box_centre.x, box_centre.y), 1e-9)?;
         let crop_from_camera = UnitQuaternion::rotation_between_axis(&to, &Vec3::z_axis())?;
         let mut extent = 0.0f64;
         for (x, y) in [
-            (bbox.x, middle.y),
-            (bbox.x + bbox.width, middle.y),
-            (middle.x, bbox.y),
-            (middle.x, bbox.y + bbox.height),
+            (bbox.x, box_centre.y),
+            (bbox.x + bbox.width, box_centre.y),
+            (box_centre.x, bbox.y),
+            (box_centre.x, bbox.y + bbox.height),
         ] {
             let p = crop_from_camera * ray(x, y);
             if p.z <= 0.0 {
@@ -164,7 +164,7 @@ mod tests {
     }
 
     #[test]
-    fn what_lies_beside_the_image_is_filled() {
+    fn pixels_outside_the_image_are_filled() {
         let camera = camera();
         let image = RgbImage::filled(640, 480, [255, 255, 255]);
         let bbox = Rect { x: -40.0, y: 200.0, width: 80.0, height: 80.0 };

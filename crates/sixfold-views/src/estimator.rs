@@ -210,7 +210,7 @@ impl PoseEstimator for ViewsEstimator {
         };
         let Some(region) = query.region else {
             let proposals = self.proposals.as_deref().ok_or(EstimatorError::Input {
-                what: "region that says where the object is",
+                what: "region that contains the object",
                 method: METHOD,
                 advice: "give --detector FILE.safetensors, --boxes, --box X,Y,W,H or --mask FILE",
             })?;

@@ -67,7 +67,7 @@ impl Views<'_> {
         instances: usize,
     ) -> Result<Vec<Hypothesis>, ViewsError> {
         let mut alike: Vec<(&Place, f32)> =
-            places.par_iter().map(|place| (place, self.likeness(&place.part))).collect();
+            places.par_iter().map(|place| (place, self.max_similarity(&place.part))).collect();
         alike.sort_by(|a, b| b.1.total_cmp(&a.1));
         alike.truncate(self.options.places.saturating_add(instances - 1));
         let mut pool: Vec<(usize, Hypothesis)> = Vec::new();
@@ -96,7 +96,7 @@ impl Views<'_> {
     }
 
     /// Similarity of a crop to its most similar template, on a subset of features: selects the places to examine further.
-    fn likeness(&self, part: &Part) -> f32 {
+    fn max_similarity(&self, part: &Part) -> f32 {
         let of = |template| quick_similarity(template, &part.map);
         self.templates.par_iter().map(of).reduce(|| f32::NEG_INFINITY, f32::max)
     }

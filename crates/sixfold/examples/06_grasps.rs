@@ -19,7 +19,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     // From here on only the depth image is used.
     let options = ViewOptions::default();
     let masks = find_objects(&seen.depth, &seen.camera, &options)?;
-    let mask = masks.first().ok_or("nothing stands on the table")?;
+    let mask = masks.first().ok_or("no object found on the table")?;
     let view = GraspView::new(&seen.depth, &seen.camera, mask, &options)?;
     let gripper = Gripper::built_in("jaws-85").ok_or("no such gripper")?;
     let grasps = antipodal_grasps(&view, &gripper, &AntipodalOptions::default())?;

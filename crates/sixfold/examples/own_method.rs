@@ -51,8 +51,10 @@ impl PoseEstimator for Median {
     ) -> Result<Vec<PoseEstimate>, EstimatorError> {
         let object: &Centre = downcast(object, METHOD)?;
         let points = &query.depth_region(METHOD)?.cloud().points;
-        let middle = |k: usize| median(&mut points.iter().map(|p| p[k]).collect::<Vec<f64>>());
-        let (Some(x), Some(y), Some(z)) = (middle(0), middle(1), middle(2)) else { return Ok(vec![]) };
+        let median_of = |k: usize| median(&mut points.iter().map(|p| p[k]).collect::<Vec<f64>>());
+        let (Some(x), Some(y), Some(z)) = (median_of(0), median_of(1), median_of(2)) else {
+            return Ok(vec![]);
+        };
         let pose = Pose::from_translation(Vec3::new(x, y, z) - object.centre);
         Ok(vec![PoseEstimate::new(pose, 1.0)])
     }

@@ -41,7 +41,7 @@ fn check(function: &str, expected: Vec<(&str, String)>) {
 }
 
 #[test]
-fn the_stub_of_python_shows_the_defaults_of_what_learns_from_images() {
+fn the_python_stub_has_the_defaults_of_image_trainings() {
     // Not part of the recipe: which of a dataset's frames are read.
     let renders_only = || ("renders_only", word(false));
     let d = sixfold::pix2pose::recipe::Pix2PoseRecipe::default();

@@ -199,8 +199,8 @@ fn correlation(a: &[[f64; 3]], b: &[[f64; 3]]) -> f64 {
             square_b += b * b;
         }
     }
-    let least = MIN_VARIATION * MIN_VARIATION * 3.0 * a.len() as f64;
-    if square_a < least || square_b < least { 0.0 } else { product / (square_a * square_b).sqrt() }
+    let minimum = MIN_VARIATION * MIN_VARIATION * 3.0 * a.len() as f64;
+    if square_a < minimum || square_b < minimum { 0.0 } else { product / (square_a * square_b).sqrt() }
 }
 
 /// Distance of the mean colours' chromaticities.

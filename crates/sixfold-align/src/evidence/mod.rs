@@ -198,10 +198,10 @@ mod tests {
     }
 
     #[test]
-    fn a_side_that_is_seen_alone_has_no_relief() {
+    fn a_single_visible_side_has_no_relief() {
         // Three sides of the box are visible; one if it faces the camera.
-        let turned = asked(&pose()).depth.unwrap().relief;
-        assert!(turned > 0.2, "{turned}");
+        let rotated = asked(&pose()).depth.unwrap().relief;
+        assert!(rotated > 0.2, "{rotated}");
         let (camera, mesh) = (camera(), cuboid());
         let facing = Pose::from_translation(Vec3::new(0.0, 0.0, 0.6));
         let depth = render_depth(&mesh, &facing, &camera).map(|z| if *z > 0.0 { *z } else { 0.9 });

@@ -116,18 +116,18 @@ impl Alignment<'_> {
             return;
         }
         let mut sizes: Vec<f64> = errors.iter().map(|(_, e)| e.norm()).collect();
-        let middle = sizes.len() / 2;
-        let noise = (*sizes.select_nth_unstable_by(middle, f64::total_cmp).1).max(0.3);
+        let half = sizes.len() / 2;
+        let noise = (*sizes.select_nth_unstable_by(half, f64::total_cmp).1).max(0.3);
         let full = self.options.correspondences / errors.len() as f64 / (noise * noise);
         let shape = self.options.shape / errors.len() as f64 / (noise * noise);
         // Rows of every pair: x and y, each with its Jacobian, error, weight and its derivative by the common shift and scale.
         let mut rows: Vec<([f64; 6], f64, f64, [f64; 3])> = Vec::with_capacity(2 * errors.len());
-        let middle =
+        let centroid =
             errors.iter().filter_map(|(p, _)| self.camera.project(p)).sum::<Vec2>() / errors.len() as f64;
         for (point, error) in &errors {
             let weight = tukey(error.norm() / noise);
             let Some(pixel) = self.camera.project(point) else { continue };
-            let arm = pixel - middle;
+            let arm = pixel - centroid;
             let [first, second] = motion(self.camera, point, centre);
             rows.push((first, error.x, weight, [1.0, 0.0, arm.x]));
             rows.push((second, error.y, weight, [0.0, 1.0, arm.y]));

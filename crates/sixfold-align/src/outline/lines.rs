@@ -258,8 +258,8 @@ pub fn add_lines(
         return;
     }
     let mut offsets: Vec<f64> = lines.iter().map(|line| line.offset.abs()).collect();
-    let middle = offsets.len() / 2;
-    let deviation = DEVIATION_FROM_MEDIAN * *offsets.select_nth_unstable_by(middle, f64::total_cmp).1;
+    let half = offsets.len() / 2;
+    let deviation = DEVIATION_FROM_MEDIAN * *offsets.select_nth_unstable_by(half, f64::total_cmp).1;
     let robust = robust * deviation.max(MIN_DEVIATION);
     for line in lines {
         let rows = motion(crop, &line.point, centre);
@@ -333,7 +333,7 @@ mod tests {
     }
 
     #[test]
-    fn an_edge_near_the_border_of_the_odds_says_where_it_is() {
+    fn an_edge_near_the_border_of_the_log_odds_shifts_the_border() {
         // With odds alone the border is where they change their sign.
         let alone = found(2.0, 0.0, 0.0);
         assert!((alone - 2.0).abs() < 0.3, "{alone}");

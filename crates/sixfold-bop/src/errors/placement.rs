@@ -5,7 +5,7 @@ use sixfold_geometry::{Mat3, Pose, Vec3};
 /// The placement of an object: `rotation * point + translation`, metres.
 ///
 /// The official evaluation uses the nine numbers of a result file unchanged, even where rounding or a network's
-/// arithmetic left them a thousandth away from a rotation. This changes an error by up to half a millimetre, so the
+/// arithmetic left them up to a hundredth away from a rotation. This changes an error by up to half a millimetre, so the
 /// errors here use the numbers unchanged too.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Placement {

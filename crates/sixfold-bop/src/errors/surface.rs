@@ -77,7 +77,7 @@ mod tests {
     }
 
     #[test]
-    fn a_half_turn_of_a_dumbbell_by_hand() {
+    fn a_rotation_of_a_dumbbell_by_180_degrees_by_hand() {
         let points = dumbbell();
         let (e, g) = (rotated_about_z(std::f64::consts::PI), rotated_about_z(0.0));
         let half_turn =
@@ -90,7 +90,7 @@ mod tests {
     }
 
     #[test]
-    fn a_quarter_turn_of_a_dumbbell_by_hand() {
+    fn a_rotation_of_a_dumbbell_by_90_degrees_by_hand() {
         // Each end moves along the chord of a quarter circle of radius 0.1 m, to either end of the other pose.
         let points = dumbbell();
         let (e, g) = (rotated_about_z(std::f64::consts::FRAC_PI_2), rotated_about_z(0.0));
@@ -100,7 +100,7 @@ mod tests {
     }
 
     #[test]
-    fn the_mean_and_the_largest_differ_where_they_should() {
+    fn the_mean_and_the_maximum_differ_as_computed_by_hand() {
         // The estimate is shifted by 30 mm in x and rotated by half a turn: ends move by 0.2 - 0.03 and 0.2 +
         // 0.03.
         let points = dumbbell();

@@ -29,7 +29,7 @@ pub fn evaluate_detection(
     options.check()?;
     let prepared =
         prepare(dataset, estimates, targets, &Mode::Detection, options.models, options.max_symmetry_step)?;
-    let least = options.visib_gt_min.unwrap_or(0.1);
+    let minimum = options.visib_gt_min.unwrap_or(0.1);
     let scored: Vec<Vec<Scored<'_, '_>>> = prepared
         .images
         .par_iter()
@@ -48,11 +48,11 @@ pub fn evaluate_detection(
         let mut positives = 0;
         let mut found: Vec<(f64, bool)> = Vec::new();
         for (task, all) in list {
-            positives += task.visible.iter().filter(|v| **v >= least).count();
+            positives += task.visible.iter().filter(|v| **v >= minimum).count();
             let matches = greedy_matches(errors(all), &task.valid, th);
             for (estimate, matched) in task.estimates.iter().zip(matches) {
                 match matched {
-                    Some(g) if task.visible[g] < least => {}
+                    Some(g) if task.visible[g] < minimum => {}
                     other => found.push((estimate.score, other.is_some())),
                 }
             }

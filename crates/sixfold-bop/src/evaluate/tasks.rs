@@ -158,7 +158,7 @@ fn localisation_tasks<'a>(
     let task = |(&obj_id, &count): (&u32, &usize)| {
         let (poses, visible) = poses_of(image, obj_id);
         let valid = match visib_gt_min {
-            Some(least) => visible.iter().map(|v| *v >= least).collect(),
+            Some(minimum) => visible.iter().map(|v| *v >= minimum).collect(),
             None => most_visible(&visible, count),
         };
         let mut estimates = found.get(&obj_id).cloned().unwrap_or_default();

@@ -125,7 +125,7 @@ fn outcome(detections: usize, skipped: &[String]) -> Outcome {
 }
 
 /// Reads and searches an image; returns it, its detections under the number `image`, and the seconds it took.
-fn look(
+fn detect_file(
     a: &DetectArguments,
     detector: &TrainedDetector,
     file: &Path,
@@ -141,7 +141,7 @@ fn in_image(a: &DetectArguments, detector: &TrainedDetector, file: &Path) -> Res
     let mut folder = a.out.as_deref().map(OutputFolder::take).transpose()?;
     let names = ["detections.json", "overlay.png", "result.json"];
     let paths = folder.as_mut().map(|f| f.files(&names)).transpose()?;
-    let (image, found, seconds) = look(a, detector, file, 0)?;
+    let (image, found, seconds) = detect_file(a, detector, file, 0)?;
     let whole = Whole {
         detections: found.iter().filter_map(FoundDetection::new).collect(),
         seconds,
@@ -182,7 +182,7 @@ fn in_images(a: &DetectArguments, detector: &TrainedDetector, files: &[PathBuf])
     let mut progress = Progress::new("images", files.len());
     let (mut images, mut all, mut skipped) = (vec![], vec![], vec![]);
     for (number, file) in (1..).zip(files) {
-        match look(a, detector, file, number) {
+        match detect_file(a, detector, file, number) {
             Ok((image, found, seconds)) => {
                 if a.out.is_some() {
                     let stem = file.file_stem().unwrap_or_default().to_string_lossy();

@@ -7,8 +7,9 @@ use sixfold_shell::output::JsonArguments;
 
 #[derive(Debug, Args)]
 pub(crate) struct DetectArguments {
-    /// Trained detector: a file that `sixfold train detector` wrote, or torchvision's weights of Faster R-CNN, Mask R-CNN or RetinaNet
-    /// on ResNet-50 with a pyramid (.pth, .pt or .safetensors; the objects of their labels: NAME.objects.json beside them)
+    /// Trained detector: a file that `sixfold train detector` wrote, or torchvision's weights of Faster R-CNN, Mask R-CNN or
+    /// RetinaNet on ResNet-50 with a pyramid (.pth, .pt or .safetensors; a file NAME.objects.json beside them maps labels to
+    /// objects)
     #[arg(long, value_name = "FILE")]
     pub weights: PathBuf,
     /// Colour images: PNG or JPEG of any size, grey or colour
@@ -23,7 +24,7 @@ pub(crate) struct DetectArguments {
     /// Targets file that lists the images (default: the dataset's test_targets_bop19.json, or all images)
     #[arg(long, value_name = "FILE", requires = "dataset", conflicts_with = "rgb")]
     pub targets: Option<PathBuf>,
-    /// Leave out these frames of the dataset, such as those of the training: JSON, [{"scene_id": 2, "im_id": 36}, ...]
+    /// Leave out these frames of the dataset, such as those used for training: JSON, [{"scene_id": 2, "im_id": 36}, ...]
     #[arg(long, value_name = "FILE", requires = "dataset", conflicts_with = "rgb")]
     pub except: Option<PathBuf>,
     /// Result: a JSON file of COCO detections for a dataset, a folder for images
@@ -35,8 +36,8 @@ pub(crate) struct DetectArguments {
     /// Only these of the detector's objects (default: all)
     #[arg(long, value_name = "ID", value_delimiter = ',')]
     pub ids: Vec<u32>,
-    /// Leave out detections with a lower score, 0 to 1 (default: the model's; 0.02 with --dataset, as average precision
-    /// wants it)
+    /// Leave out detections with a lower score, 0 to 1 (default: the model's; 0.02 with --dataset, since average precision includes
+    /// low scores)
     #[arg(long, value_name = "SCORE")]
     pub threshold: Option<f32>,
     /// If two boxes of an object overlap more than this (intersection over union), keep only the better one

@@ -30,8 +30,8 @@ pub(crate) struct EvalArguments {
     /// Folder of the dataset's models, such as models_cad or models_reconst of T-LESS (default: models_eval, or models without it)
     #[arg(long, value_name = "FOLDER", value_parser = folder_name)]
     pub models: Option<String>,
-    /// Targets file, or all: every annotated pose that is at least 10 % visible (default: the dataset's test_targets_bop19.json, or all
-    /// without it; with --preset published all)
+    /// Targets file, or all: every annotated pose that is at least 10 % visible (default: the dataset's test_targets_bop19.json, or
+    /// all without it; with --preset published all)
     #[arg(long, value_name = "FILE|all")]
     pub targets: Option<PathBuf>,
     /// Score only these objects (default: all)
@@ -43,13 +43,13 @@ pub(crate) struct EvalArguments {
     /// COCO detections to score by box AP (and mask AP where they have masks)
     #[arg(long, value_name = "FILE.json", conflicts_with = "results")]
     pub detections: Option<PathBuf>,
-    /// Leave out these frames, such as those of a training: JSON, [{"scene_id": 2, "im_id": 36}, ...]
+    /// Leave out these frames, such as those used for training: JSON, [{"scene_id": 2, "im_id": 36}, ...]
     #[arg(long, value_name = "FILE")]
     pub except: Option<PathBuf>,
     /// With --detections: minimum score of detections that count for recall and false detections, 0 to 1
     #[arg(long, value_name = "SCORE", default_value = "0.4", value_parser = score)]
     pub min_score: f64,
-    /// With --detections: ignore object ids, for a detector for any object
+    /// With --detections: ignore object ids, for a class-agnostic detector
     #[arg(long, requires = "detections", conflicts_with = "results")]
     pub one_class: bool,
     /// With --detections: write the ground truth as a COCO file
@@ -64,8 +64,8 @@ pub(crate) struct EvalArguments {
     /// Leave out VSD, which renders every pose
     #[arg(long)]
     pub no_vsd: bool,
-    /// VSD as in the dissertation (table 3.6) and the benchmark of 2018: recall at an error below 0.3, tolerance 20 mm, nothing visible
-    /// where depth is missing, every pose that is at least 10 % visible
+    /// VSD as in the dissertation (table 3.6) and the benchmark of 2018: recall at an error below 0.3, tolerance 20 mm, nothing
+    /// visible where depth is missing, every pose that is at least 10 % visible
     #[arg(long, value_parser = ["published"], conflicts_with_all = ["no_vsd", "detections"])]
     pub preset: Option<String>,
     /// VSD's tolerance of depth between the two poses, millimetres (default: 5 to 50 % of the diameter in ten steps; with --preset
@@ -75,8 +75,8 @@ pub(crate) struct EvalArguments {
     /// VSD's error below which a pose is right, 0 to 1 (default: 0.05 to 0.5 in ten steps; with --preset published: 0.3)
     #[arg(long, value_name = "ERROR", value_parser = score, conflicts_with_all = ["no_vsd", "detections"])]
     pub vsd_threshold: Option<f64>,
-    /// VSD's tolerance of depth in visibility, millimetres (default: as in the BOP Challenge, 5 for a dataset folder named itodd, 15
-    /// for all others)
+    /// VSD's tolerance of depth in visibility, millimetres (default: as in the BOP Challenge, 5 for a dataset folder named itodd,
+    /// 15 for all others)
     #[arg(long, value_name = "MM", conflicts_with_all = ["no_vsd", "detections"])]
     pub vsd_delta: Option<f64>,
     /// Plot of the recall curves

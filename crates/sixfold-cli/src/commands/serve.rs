@@ -35,7 +35,7 @@ mod built_in {
         /// Port to listen on; 0 takes any free one
         #[arg(long, value_name = "N", default_value = "8640")]
         pub port: u16,
-        /// What every client has to know, 16 characters or more (better in SIXFOLD_TOKEN: other users see a command's arguments)
+        /// Token that clients must send, 16 characters or more (better in SIXFOLD_TOKEN: other users see a command's arguments)
         #[arg(long, value_name = "TOKEN", env = "SIXFOLD_TOKEN", hide_env_values = true)]
         pub token: Option<String>,
         /// Folder of stored objects

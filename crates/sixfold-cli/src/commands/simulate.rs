@@ -50,8 +50,8 @@ pub(crate) struct SimulateArguments {
     /// Split of the dataset
     #[arg(long, default_value = "test", value_parser = folder_name)]
     pub split: String,
-    /// Folder of the dataset's models to render and copy, such as models_cad or models_reconst of T-LESS (default: models, or models_eval
-    /// without it)
+    /// Folder of the dataset's models to render and copy, such as models_cad or models_reconst of T-LESS (default: models, or
+    /// models_eval without it)
     #[arg(long, value_name = "FOLDER", value_parser = folder_name)]
     pub models: Option<String>,
     /// New dataset folder
@@ -138,7 +138,7 @@ pub(crate) fn run(a: &SimulateArguments) -> Result<Outcome> {
     let targets: Vec<Target> = dataset.targets(None)?.into_iter().filter(|t| wanted(t.im_id)).collect();
     write_targets(&targets_file, &targets)?;
     for image in &without_table {
-        eprintln!("note: image {image}: no plane lies under its objects, simulated without a table");
+        eprintln!("note: image {image}: no plane found under its objects, simulated without a table");
     }
     let value = json!({ "images": images, "without_table": without_table, "out": a.out });
     report(&a.json, &value, || println!("{images} images with simulated depth in {}", a.out.display()))?;

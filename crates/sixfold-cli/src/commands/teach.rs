@@ -30,11 +30,11 @@ pub(crate) const AFTER_HELP: &str = "Examples:\n  \
 pub(crate) struct TeachArguments {
     /// Name of the object: letters, digits, - and _
     pub name: String,
-    /// Photographs of the object, on the board but for --no-board (PNG, JPEG), or folders of them: 8 to 40, from all sides; or one JSON file that lists
-    /// photographs with the object's pose in each, masks and depth (docs/teach.md), without a board
+    /// Photographs of the object, on the board unless --no-board (PNG, JPEG), or folders of them: 8 to 40, from all sides; or one
+    /// JSON file that lists photographs with the object's pose in each, masks and depth (docs/teach.md), without a board
     #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
     pub photographs: Vec<PathBuf>,
-    /// Depth images from the same places (PNG, 16 bit), or folders of them, in the order of the photographs' names
+    /// Depth images from the same viewpoints (PNG, 16 bit), or folders of them, in the order of the photographs' names
     #[arg(long, num_args = 1.., value_name = "DIR", requires = "depth_scale")]
     pub depth: Vec<PathBuf>,
     /// Millimetres per unit of the depth images
@@ -46,7 +46,7 @@ pub(crate) struct TeachArguments {
     /// Measured length of the printed ruler, millimetres (default: 100)
     #[arg(long, value_name = "MM")]
     pub ruler: Option<f64>,
-    /// The photographs show no board: poses from what is around the object, which needs texture and stays in place; needs
+    /// The photographs show no board: camera poses come from the object's surroundings, which need texture and must not move; needs
     /// --length, or depth
     #[arg(long, conflicts_with = "ruler")]
     pub no_board: bool,

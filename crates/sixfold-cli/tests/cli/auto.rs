@@ -10,7 +10,7 @@ use crate::support::*;
 const DEPTH: &str = "estimate --method auto --depth depth.png --camera camera.json --unit mm";
 
 #[test]
-fn says_how_probable_a_pose_is_and_what_is_not_there() {
+fn it_prints_probabilities_and_absent_objects() {
     let case = OneImage::new();
     let dir = case.path();
     write_other_part(dir);

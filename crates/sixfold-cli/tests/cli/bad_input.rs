@@ -28,7 +28,7 @@ fn truncated_mesh() {
 }
 
 #[test]
-fn mesh_that_lies_about_its_length() {
+fn mesh_with_a_wrong_length() {
     let text = ascii_ply(&["0 0 0", "10 0 0"], 4_000_000_000);
     estimate_fails(|dir| std::fs::write(dir.join("part.ply"), text).unwrap(), "", &["part.ply", "vertex"]);
 }
@@ -90,7 +90,7 @@ fn truncated_images() {
 }
 
 #[test]
-fn image_whose_header_promises_too_much() {
+fn image_whose_header_claims_too_much() {
     // The width in the PNG header becomes two billion; its checksum is left wrong.
     let widen = |dir: &Path| {
         let mut bytes = std::fs::read(dir.join("depth.png")).unwrap();

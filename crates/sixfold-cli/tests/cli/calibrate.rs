@@ -119,7 +119,7 @@ fn photographs_that_cannot_be_used_are_left_out_with_the_reason() {
 }
 
 #[test]
-fn what_gives_no_camera_is_an_error_that_says_what_to_do() {
+fn errors_of_calibration_give_advice() {
     let case = tempfile::tempdir().unwrap();
     let dir = case.path();
     write_photographs(&dir.join("photographs"));

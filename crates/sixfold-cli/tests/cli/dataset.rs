@@ -48,7 +48,7 @@ fn all_targets_are_estimated_and_score_well() {
 }
 
 #[test]
-fn a_cut_off_run_goes_on_to_the_same_result() {
+fn an_interrupted_run_resumes_to_the_same_result() {
     let tiny = Tiny::new(true);
     let csv = tiny.path().join("results.csv");
     sixfold(tiny.path(), ARGUMENTS).expect(0);
@@ -106,10 +106,10 @@ fn boxes_of_the_ground_truth_or_of_a_file() {
 
     // Boxes for one of the objects in one image only.
     let tiny = Tiny::new(true);
-    let middle = camera().project(&tiny.truth_of(4, 2).translation()).unwrap();
+    let centre = camera().project(&tiny.truth_of(4, 2).translation()).unwrap();
     let detections = serde_json::json!([{
         "scene_id": 7, "image_id": 4, "category_id": 2, "score": 0.8,
-        "bbox": [middle.x - 45.0, middle.y - 55.0, 90.0, 90.0],
+        "bbox": [centre.x - 45.0, centre.y - 55.0, 90.0, 90.0],
     }]);
     std::fs::write(tiny.path().join("boxes.json"), detections.to_string()).unwrap();
     sixfold(tiny.path(), &format!("{ARGUMENTS} --boxes boxes.json")).expect(0);
@@ -264,10 +264,10 @@ fn two_runs_on_one_result_file_do_not_mix_their_rows() {
 #[test]
 fn detections_without_scene_id_are_of_the_only_scene_or_refused() {
     let tiny = Tiny::new(true);
-    let middle = camera().project(&tiny.truth_of(4, 2).translation()).unwrap();
+    let centre = camera().project(&tiny.truth_of(4, 2).translation()).unwrap();
     let mut detection = serde_json::json!({
         "image_id": 4, "category_id": 2, "score": 0.8,
-        "bbox": [middle.x - 45.0, middle.y - 55.0, 90.0, 90.0],
+        "bbox": [centre.x - 45.0, centre.y - 55.0, 90.0, 90.0],
     });
     let write = |detection: &Value| {
         let text = serde_json::json!([detection]).to_string();

@@ -96,12 +96,16 @@ fn a_detector_is_trained_and_used() {
     let note = run.stderr.lines().find(|l| l.contains("by the detector")).unwrap();
     assert!(note.contains("of 3 objects"), "{note}");
     let other = views.replace("--ids 1", "--ids 1,2");
-    fails(tiny.path(), &format!("{other} --detector {WEIGHTS} --out more"), &["detector", "not object 2"]);
+    fails(tiny.path(), &format!("{other} --detector {WEIGHTS} --out more"), &["detector", "not on object 2"]);
 
     // Objects that it was not trained on.
-    fails(tiny.path(), &detect(&format!("{rgb} --ids 2")), &["--ids", "knows the objects 1", "not object 2"]);
+    fails(
+        tiny.path(),
+        &detect(&format!("{rgb} --ids 2")),
+        &["--ids", "trained on objects 1", "not on object 2"],
+    );
     let estimate = "estimate --dataset tiny --out r.csv --detector detector/model.safetensors";
-    fails(tiny.path(), estimate, &["detector", "not object 2"]);
+    fails(tiny.path(), estimate, &["detector", "not on object 2"]);
     fails(tiny.path(), "estimate --dataset tiny --out r.csv --boxes detect", &["--detector"]);
 }
 
@@ -224,7 +228,7 @@ fn weights_of_torchvision_are_a_detector() {
     fails(
         tiny.path(),
         &format!("detect --weights faster.pth {rgb} --ids 9"),
-        &["--ids", "knows the objects 1, 2, 3"],
+        &["--ids", "trained on objects 1, 2, 3"],
     );
 
     // A dataset, with other objects of the labels.

@@ -121,7 +121,7 @@ fn models_of_another_folder_are_scored_with() {
 }
 
 #[test]
-fn what_cannot_be_computed_is_null_with_a_reason() {
+fn missing_scores_are_null_with_a_reason() {
     let tiny = Tiny::new(false);
     tiny.write_truth_as_results("results.csv");
     let json = sixfold(tiny.path(), &format!("{ARGUMENTS} --json")).expect(0).json();

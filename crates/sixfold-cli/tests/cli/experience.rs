@@ -77,7 +77,7 @@ fn experience_is_stored_shown_used_merged_exported_and_forgotten() {
 }
 
 #[test]
-fn a_hand_learns_and_goes_on() {
+fn learning_grasps_resumes() {
     let case = folder();
     let path = case.path();
     let learn = "grasp learn --experiences e.db --object part.ply --unit mm --attempts 3 --tries 3 --near 9 --weights w.safetensors --out learn --json";

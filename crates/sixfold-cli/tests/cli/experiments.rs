@@ -55,7 +55,7 @@ fn the_other_program_is_run_from_beside_or_from_the_path() {
 }
 
 #[test]
-fn without_the_other_program_it_says_how_to_get_it() {
+fn without_the_other_program_it_explains_the_installation() {
     let alone = tempfile::tempdir().unwrap();
     for command in COMMANDS {
         let failed = run(alone.path(), "/nowhere", command).expect(2);

@@ -179,7 +179,7 @@ fn start(dir: &Path, arguments: &str) -> std::process::Child {
 }
 
 #[test]
-fn an_object_survives_two_who_replace_it_at_once_and_kills_at_any_moment() {
+fn an_object_survives_concurrent_replacement_and_kills() {
     let case = OneImage::new();
     let dir = case.path();
     let add = "object add part part.ply --unit mm --replace";

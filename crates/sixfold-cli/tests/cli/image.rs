@@ -31,14 +31,14 @@ fn finds_the_pose_and_draws_it() {
     // The overlay colours the object's pixels and leaves the rest of the image unchanged.
     let overlay = image::open(case.path().join("out/overlay.png")).unwrap().to_rgb8();
     assert_eq!(overlay.dimensions(), (WIDTH as u32, HEIGHT as u32));
-    let middle = camera().project(&case.truth.transform_point(&part().vertices()[0])).unwrap();
+    let centre = camera().project(&case.truth.transform_point(&part().vertices()[0])).unwrap();
     let changed: Vec<(f64, f64)> = overlay
         .enumerate_pixels()
         .filter(|(_, _, p)| p.0 != [90; 3])
         .map(|(x, y, _)| (f64::from(x), f64::from(y)))
         .collect();
     assert!(changed.len() > 1000, "{} pixels drawn", changed.len());
-    assert!(changed.iter().all(|(x, y)| (x - middle.x).hypot(y - middle.y) < 120.0));
+    assert!(changed.iter().all(|(x, y)| (x - centre.x).hypot(y - centre.y) < 120.0));
     // The description was stored in the cache, and nothing beside the mesh.
     assert!(cached(case.path(), "ppf.bin").is_file());
     let mut beside: Vec<_> = std::fs::read_dir(case.path())
@@ -77,7 +77,7 @@ fn any_seed_finds_the_pose() {
 }
 
 #[test]
-fn a_table_prints_where_no_json_is_asked_for() {
+fn a_table_is_printed_without_json() {
     let case = OneImage::new();
     let run = sixfold(case.path(), &format!("{} --json poses.json", OneImage::ARGUMENTS)).expect(0);
     assert!(run.stdout.lines().any(|l| l.starts_with("part ")), "{}", run.stdout);

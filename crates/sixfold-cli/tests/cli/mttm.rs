@@ -44,7 +44,7 @@ fn an_object_is_stored_with_templates_and_found() {
     let case = OneImage::new();
     let dir = case.path();
     let run = sixfold(dir, "object add thing part.ply --unit mm --templates").expect(0);
-    assert!(run.stdout.contains("305 views with 7 turns"), "{}", run.stdout);
+    assert!(run.stdout.contains("305 views with 7 rotations"), "{}", run.stdout);
     let file = dir.join("sixfold-objects/thing/templates.bin");
     let bytes = std::fs::read(&file).unwrap();
     let one = sixfold(dir, &format!("--threads 1 {DEPTH} --object thing --json")).expect(0).json();
@@ -69,7 +69,7 @@ fn an_object_is_stored_with_templates_and_found() {
 }
 
 #[test]
-fn an_object_seen_once_in_depth_is_found_in_another_place() {
+fn an_object_known_from_one_depth_image_is_found_elsewhere() {
     let case = OneImage::new();
     let dir = case.path();
     write_part_mask(&case);
@@ -113,7 +113,7 @@ fn an_object_seen_once_in_depth_is_found_in_another_place() {
 }
 
 #[test]
-fn templates_from_around_find_what_lies_upside_down() {
+fn templates_from_around_find_objects_upside_down() {
     let case = OneImage::new();
     let dir = case.path();
     // Upside down, on its tower.
@@ -222,7 +222,7 @@ fn a_store_of_another_version_is_refused_and_kept() {
 }
 
 #[test]
-fn a_dataset_is_estimated_and_it_goes_on() {
+fn a_dataset_run_resumes() {
     let tiny = Tiny::new(true);
     let dir = tiny.path();
     let estimate = "estimate --method mttm --dataset tiny --out results.csv --json";

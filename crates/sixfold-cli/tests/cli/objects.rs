@@ -157,7 +157,7 @@ fn symmetries_are_not_found_twice() {
 }
 
 #[test]
-fn render_writes_what_is_seen() {
+fn render_writes_the_visible_object() {
     let case = OneImage::new();
     let dir = case.path();
     let t = case.truth.translation();

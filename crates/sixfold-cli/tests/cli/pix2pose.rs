@@ -23,10 +23,10 @@ fn one_image(tiny: &Tiny) -> String {
     let truth = tiny.truth_of(4, 1);
     let corners: Vec<_> =
         part().vertices().iter().filter_map(|v| camera().project(&truth.transform_point(v))).collect();
-    let least = |f: fn(&sixfold_geometry::Vec2) -> f64| corners.iter().map(f).fold(f64::INFINITY, f64::min);
+    let minimum = |f: fn(&sixfold_geometry::Vec2) -> f64| corners.iter().map(f).fold(f64::INFINITY, f64::min);
     let most =
         |f: fn(&sixfold_geometry::Vec2) -> f64| corners.iter().map(f).fold(f64::NEG_INFINITY, f64::max);
-    let (x, y) = (least(|c| c.x), least(|c| c.y));
+    let (x, y) = (minimum(|c| c.x), minimum(|c| c.y));
     format!("{} --box {x},{y},{},{}", without_box(), most(|c| c.x) - x, most(|c| c.y) - y)
 }
 
@@ -42,7 +42,7 @@ fn json_of(file: &Path) -> Value {
 }
 
 #[test]
-fn a_network_trained_on_three_pictures_finds_the_object_in_them() {
+fn a_network_trained_on_three_images_finds_the_object_in_them() {
     let tiny = Tiny::coloured();
     let trained = sixfold(tiny.path(), &format!("{} --json", train(160))).expect(0).json();
     assert_eq!((&trained["steps"], &trained["photographs"]), (&160.into(), &3.into()));
@@ -124,7 +124,7 @@ fn a_network_trained_on_three_pictures_finds_the_object_in_them() {
 }
 
 #[test]
-fn a_training_goes_on_and_is_not_mixed_with_another() {
+fn a_training_resumes_and_is_not_mixed_with_another() {
     let tiny = Tiny::coloured();
     fails(tiny.path(), &format!("{} --export", train(3)), &["trained", "no checkpoint"]);
     sixfold(tiny.path(), &train(3)).expect(0);
@@ -200,14 +200,14 @@ fn a_preset_brings_its_thresholds_and_symmetries() {
     assert!(lmo.card().data.contains("parameters for lmo"), "{}", lmo.card().data);
     assert!(!quiet.contains("appendix A"), "{quiet}");
     // Object 1 of T-LESS is symmetric about z; this one, which is not a cylinder, is not.
-    let (tless, told) = model("tless");
+    let (tless, output) = model("tless");
     assert_eq!(tless.objects()[0].thresholds, [0.1]);
     assert!(
-        told.contains(
+        output.contains(
             "0 discrete and 1 continuous symmetries of appendix A in place of the dataset's 0 and 0"
         )
     );
-    assert!(told.contains("warning: object 1: under a declared symmetry"), "{told}");
+    assert!(output.contains("warning: object 1: under a declared symmetry"), "{output}");
     assert_eq!(model("bop").0.objects()[0].thresholds, [0.15, 0.25, 0.35]);
 }
 
@@ -268,7 +268,7 @@ fn bad_boxes_weights_and_objects() {
         &["other.safetensors", "pix2pose-another"],
     );
 
-    fails(tiny.path(), &format!("{boxed} --object-id 2"), &["knows the objects 1", "object 2"]);
+    fails(tiny.path(), &format!("{boxed} --object-id 2"), &["trained on objects 1", "object 2"]);
     fails(
         tiny.path(),
         &boxed.replace("obj_000001.ply", "obj_000002.ply"),
@@ -289,5 +289,5 @@ fn bad_boxes_weights_and_objects() {
     // A target of the dataset that the model was not trained on.
     let all =
         format!("estimate --method pix2pose --weights {WEIGHTS} --dataset tiny --boxes gt --out results.csv");
-    fails(tiny.path(), &all, &["knows the objects 1", "object 2"]);
+    fails(tiny.path(), &all, &["trained on objects 1", "object 2"]);
 }

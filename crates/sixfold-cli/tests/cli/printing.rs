@@ -5,7 +5,7 @@ use sixfold_mesh::{PlyFormat, Unit, write_ply};
 use crate::support::*;
 
 #[test]
-fn errors_are_json_where_json_was_asked_for() {
+fn errors_are_json_with_json() {
     let dir = tempfile::tempdir().unwrap();
     let eval = "eval --dataset nowhere --results results.csv";
     let run = sixfold(dir.path(), &format!("{eval} --json")).expect(2);
@@ -32,7 +32,7 @@ fn errors_are_json_where_json_was_asked_for() {
 
 #[cfg(feature = "experience")]
 #[test]
-fn passwords_are_not_shown_wherever_an_address_is_given() {
+fn passwords_are_never_printed_with_an_address() {
     let dir = tempfile::tempdir().unwrap();
     for address in [
         "postgres://robot:secret@127.0.0.1:1/fleet",

@@ -167,7 +167,7 @@ fn photographs(tiny: &Tiny, change: impl Fn(usize, &mut Value)) -> String {
 }
 
 #[test]
-fn photographs_of_a_file_and_what_may_be_wrong_with_them() {
+fn photographs_of_a_file_and_their_errors() {
     let tiny = Tiny::coloured();
     let run = photographs(&tiny, |_, _| ());
     let json = sixfold(tiny.path(), &format!("{run} --out a --json")).expect(0).json();

@@ -109,7 +109,7 @@ fn a_taught_object_is_found_in_a_new_depth_image() {
 }
 
 #[test]
-fn photographs_that_teach_nothing_say_what_to_do() {
+fn unusable_photographs_are_an_error_with_advice() {
     let case = tempfile::tempdir().unwrap();
     write_photographs(&case.path().join("two"), 2);
     write_camera(&case.path().join("camera.json"));

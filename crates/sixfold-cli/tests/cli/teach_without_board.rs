@@ -74,7 +74,7 @@ fn an_object_is_taught_without_a_board() {
 }
 
 #[test]
-fn what_is_missing_is_said_before_anything_takes_time() {
+fn missing_arguments_are_reported_before_any_computation() {
     let case = tempfile::tempdir().unwrap();
     std::fs::create_dir(case.path().join("bare")).unwrap();
     for i in 0..4u8 {

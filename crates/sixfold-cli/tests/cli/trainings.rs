@@ -188,13 +188,13 @@ fn options_that_no_training_can_have() {
 fn help_shows_the_defaults() {
     let dir = tempfile::tempdir().unwrap();
     let shown = [
-        ("pix2pose", "(default: 8000; the dissertation's networks: 25000). 0: the weights"),
+        ("pix2pose", "(default: 8000; the dissertation's networks: 25000). 0: keep the weights"),
         ("pix2pose", "(default: 4; the dissertation's networks: 50)"),
         ("pix2pose", "(default: 0.002; the dissertation's networks: 0.0001)"),
         ("pix2pose", "Largest rotation of photographs in the image plane, degrees [default: 45]"),
         ("pix2pose", "Side of the network's input in pixels; the output has half of it [default: 128]"),
         ("pix2pose", "- tless: T-LESS"),
-        ("detector", "Highest learning rate [default: 0.002]"),
+        ("detector", "Maximum learning rate [default: 0.002]"),
         ("detector", "Largest rotation in the image plane, degrees [default: 15]"),
         ("detector", "Default score threshold of the detector, 0 to 1 [default: 0.4]"),
         ("nol", "(default: 5000; the dissertation's network: 350000)"),
@@ -205,7 +205,7 @@ fn help_shows_the_defaults() {
         #[cfg(feature = "experience")]
         ("dgcm", "(default: 10, with 3 negative ones; the dissertation's network: 25 of both)"),
         #[cfg(feature = "experience")]
-        ("dgcm", "features' (default: 300; the dissertation's network: 1)"),
+        ("dgcm", "feature loss (default: 300; the dissertation's network: 1)"),
     ];
     for (training, text) in shown {
         let help = sixfold(dir.path(), &format!("train {training} --help")).expect(0).stdout;

@@ -3,7 +3,7 @@
 use crate::support::*;
 
 #[test]
-fn what_needs_a_network_names_the_feature() {
+fn commands_that_need_networks_name_the_feature() {
     let case = OneImage::new();
     let mttm = "estimate --method mttm --depth depth.png --camera camera.json --object part.ply --unit mm";
     let mttm = |option: &str| format!("{mttm} {option}");

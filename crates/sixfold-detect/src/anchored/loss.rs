@@ -266,7 +266,7 @@ mod tests {
     }
 
     #[test]
-    fn codes_of_boxes_lie_where_the_network_has_them() {
+    fn codes_of_boxes_are_at_the_indices_of_the_network() {
         // Anchor 3 of two pixels with two anchors each: second of the second pixel.
         let layout = Layout { pixels: 2, per_pixel: 2 };
         assert_eq!([0, 1, 2, 3].map(|i| layout.place(3, i, 4)), [9, 11, 13, 15]);

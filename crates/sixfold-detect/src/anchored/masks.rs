@@ -94,7 +94,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_full_mask_fills_its_box_and_what_is_outside_of_the_image_is_cut() {
+    fn a_full_mask_fills_its_box_and_is_clipped_to_the_image() {
         let full = MaskProbabilities { values: vec![1.0; MASK_SIDE * MASK_SIDE] };
         // The numbers are those of paste_masks_in_image(torch.ones(1, 1, 28, 28), box, (40, 60)) >= 0.5: one pixel more on the right
         // and below, as the whole box counts its last pixel.

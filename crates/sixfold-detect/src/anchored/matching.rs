@@ -99,7 +99,7 @@ mod tests {
     const LIMITS: Limits = Limits { object: 0.7, background: 0.3, best: true };
 
     #[test]
-    fn boxes_stand_for_what_they_overlap_most() {
+    fn boxes_are_matched_by_their_overlap() {
         let objects = [[0.0, 0.0, 10.0, 10.0], [100.0, 0.0, 110.0, 40.0]];
         let boxes = [
             [0.0, 0.0, 10.0, 9.0],

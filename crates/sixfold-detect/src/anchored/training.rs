@@ -431,7 +431,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_to_be_learnt_is_no_background_and_flat_objects_are_left_out() {
+    fn ignored_objects_are_no_background_and_flat_objects_are_left_out() {
         let mut labels = vec![0; 64 * 64];
         labels[20 * 64 + 20] = IGNORED;
         let flat = Instance { class: 1, corners: [5.0, 5.0, 5.0, 9.0] };

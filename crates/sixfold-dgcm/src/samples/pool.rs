@@ -197,9 +197,9 @@ fn view(
     let turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw);
     let mut world_from_object = Pose::new(turn, Vec3::zeros()) * rest.rotation();
     let (low, high) = mesh.transformed(&world_from_object).bounding_box();
-    let middle = (low + high) * 0.5;
+    let box_centre = (low + high) * 0.5;
     world_from_object = world_from_object
-        .with_translation(world_from_object.translation() - Vec3::new(middle.x, middle.y, low.z));
+        .with_translation(world_from_object.translation() - Vec3::new(box_centre.x, box_centre.y, low.z));
     let target = aside + Vec3::z() * (0.5 * (high.z - low.z));
     let camera_from_world = camera_from_world(elevation, distance, roll, &target);
     let camera_from_object = camera_from_world * world_from_object;

@@ -137,8 +137,8 @@ pub fn transfer(
         if found.iter().any(|f| f.camera_from_experience.rotation_angle_to(&rotation) < 4f64.to_radians()) {
             continue;
         }
-        let turned: Vec<Vec3> = experience_points.iter().map(|p| rotation.transform_point(p)).collect();
-        let (Some(source), Some(target)) = (Extent::of(&turned, 0.02), Extent::of(&points, 0.02)) else {
+        let rotated: Vec<Vec3> = experience_points.iter().map(|p| rotation.transform_point(p)).collect();
+        let (Some(source), Some(target)) = (Extent::of(&rotated, 0.02), Extent::of(&points, 0.02)) else {
             continue;
         };
         let start = rotation.with_translation(target.centre - source.centre);
@@ -222,11 +222,12 @@ fn refine(
     };
     match icp(&source, cloud, start, &icp_options) {
         Ok(report) => {
-            let middle = source.centroid().unwrap_or_else(Vec3::zeros);
-            let moved =
-                (report.target_from_source.transform_point(&middle) - start.transform_point(&middle)).norm();
-            let turned = report.target_from_source.rotation_angle_to(start);
-            if moved <= options.icp_distance && turned <= options.icp_angle {
+            let source_centroid = source.centroid().unwrap_or_else(Vec3::zeros);
+            let moved = (report.target_from_source.transform_point(&source_centroid)
+                - start.transform_point(&source_centroid))
+            .norm();
+            let rotated = report.target_from_source.rotation_angle_to(start);
+            if moved <= options.icp_distance && rotated <= options.icp_angle {
                 (report.target_from_source, Some(report.rms))
             } else {
                 (*start, None)

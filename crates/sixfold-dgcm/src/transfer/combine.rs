@@ -104,9 +104,9 @@ fn mean_pose(poses: &[Pose]) -> Pose {
     let (mut translation, mut rotation) = (Vec3::zeros(), Quaternion::from_parts(0.0, Vec3::zeros()));
     let first = poses.first().copied().unwrap_or_else(Pose::identity);
     for pose in poses {
-        let turned = *pose * half_turn;
+        let rotated = *pose * half_turn;
         let nearer =
-            if turned.rotation_angle_to(&first) < pose.rotation_angle_to(&first) { turned } else { *pose };
+            if rotated.rotation_angle_to(&first) < pose.rotation_angle_to(&first) { rotated } else { *pose };
         let q = nearer.rotation().into_inner();
         let sign = if q.dot(&first.rotation().into_inner()) < 0.0 { -1.0 } else { 1.0 };
         rotation += q * sign;
@@ -189,9 +189,9 @@ pub fn rank_on_part(
 ) -> Vec<Ranked> {
     let mut candidates = candidates(geometry, &experience.proposals, clusters);
     for c in &mut candidates {
-        let least = if c.kind == Kind::Experience { 0.01 } else { 0.0 };
+        let minimum = if c.kind == Kind::Experience { 0.01 } else { 0.0 };
         c.score = c.success_probability(&c.grasp, fitter, outcomes)
-            * experience.holds_the_same(&c.grasp, fitter.gripper()).max(least);
+            * experience.holds_the_same(&c.grasp, fitter.gripper()).max(minimum);
     }
     candidates.retain(|c| c.score > 0.0);
     joined(candidates, clusters).0
@@ -362,12 +362,12 @@ mod tests {
             let tip = Vec3::new(x, 0.0, 0.575);
             fitter.fit(&gripper_pose(&tip, &Vec3::z(), &Vec3::y()).unwrap(), 0.06).unwrap()
         };
-        let (end, middle) = (at(0.12), at(0.05));
+        let (end, centre) = (at(0.12), at(0.05));
         // A gripper that lost every object over which its pads reached by less than 3 cm, wherever it was held.
         let attempts: Vec<Attempt> = (0..80)
             .map(|k| {
                 let overlap = 0.001 * f64::from(k % 50);
-                let description = GraspDescription { overlap, ..fitter.describe(&middle) };
+                let description = GraspDescription { overlap, ..fitter.describe(&centre) };
                 Attempt {
                     description,
                     share: 0.0,
@@ -382,18 +382,18 @@ mod tests {
             .collect();
         let clusters = ClusterOptions::default();
         let rank =
-            |outcomes: &OutcomeModel| rank_by_outcome(&[end, middle], &[], &clusters, &fitter, outcomes);
+            |outcomes: &OutcomeModel| rank_by_outcome(&[end, centre], &[], &clusters, &fitter, outcomes);
         let untaught = rank(&OutcomeModel::default());
-        assert!(untaught[0].grasp.camera_from_gripper.translation().x < 0.06, "nearer to the middle");
+        assert!(untaught[0].grasp.camera_from_gripper.translation().x < 0.06, "nearer to the centre");
         let taught = rank(&OutcomeModel::learn(&attempts, &gripper.name));
         assert_eq!(taught.len(), 2);
         let depth = |r: &Ranked| fitter.describe(&r.grasp).overlap;
         assert!(
-            depth(&taught[0]) > fitter.describe(&middle).overlap + 0.005,
+            depth(&taught[0]) > fitter.describe(&centre).overlap + 0.005,
             "it reaches deeper: {taught:?}"
         );
         let outcomes = OutcomeModel::learn(&attempts, &gripper.name);
-        let unmoved = outcomes.success_probability(&fitter.describe(&middle), 0.0, false);
+        let unmoved = outcomes.success_probability(&fitter.describe(&centre), 0.0, false);
         assert!(taught[0].score > 1.5 * unmoved, "{} {unmoved}", taught[0].score);
         assert!(taught.is_sorted_by(|a, b| a.score >= b.score));
         // The moved grasp still satisfies the planner's tests.
@@ -402,7 +402,7 @@ mod tests {
     }
 
     #[test]
-    fn on_a_part_what_holds_its_counterpart_comes_first() {
+    fn on_a_part_grasps_of_its_counterpart_come_first() {
         let view = bar();
         let gripper = Gripper::built_in("jaws-85").unwrap();
         let options = AntipodalOptions { completion: None, ..AntipodalOptions::default() };
@@ -420,8 +420,13 @@ mod tests {
         let mut held_before = vec![0.0; crop.mask.len()];
         crop.pixels().filter(|&i| crop.points[i][0] < -0.06).for_each(|i| held_before[i] = 0.7);
         let elsewhere = Proposal { grasp: at(0.06), ..proposal(0.0, 0.9) };
-        let found =
-            Proposals { nearest: vec![], crop, proposals: vec![elsewhere], held_before, middles: vec![] };
+        let found = Proposals {
+            nearest: vec![],
+            crop,
+            proposals: vec![elsewhere],
+            held_before,
+            grasp_centres: vec![],
+        };
         // The success probability is highest at the centre of the bar, but its left end was requested.
         let ranked = rank_on_part(
             &[at(0.0), at(-0.09)],
@@ -432,7 +437,7 @@ mod tests {
         );
         let places: Vec<f64> =
             ranked.iter().map(|r| r.grasp.camera_from_gripper.translation().x.signum()).collect();
-        assert_eq!(places, [-1.0, 1.0], "the left end, then the transferred one; the middle is left out");
+        assert_eq!(places, [-1.0, 1.0], "the left end, then the transferred one; the centre is left out");
         assert_eq!((ranked[0].kind, ranked[1].kind), (Kind::Geometry, Kind::Experience));
     }
 

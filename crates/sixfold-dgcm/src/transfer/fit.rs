@@ -104,10 +104,10 @@ impl Shape {
                     for dx in -REACH..=REACH {
                         let there = [cell.x + dx, cell.y + dy, cell.z + dz];
                         let Some(at) = self.index(there) else { continue };
-                        let middle = self.low
+                        let centre = self.low
                             + Vec3::new(there[0] as f64 + 0.5, there[1] as f64 + 0.5, there[2] as f64 + 0.5)
                                 * CELL;
-                        let far = (middle - p).norm_squared() / (NEAR * NEAR);
+                        let far = (centre - p).norm_squared() / (NEAR * NEAR);
                         self.cells[at] = self.cells[at].max((-0.5 * far).exp() as f32);
                     }
                 }
@@ -131,14 +131,14 @@ impl Shape {
     }
 
     /// The centre of the bounding box of points, seen from above.
-    pub(crate) fn middle(points: impl IntoIterator<Item = Vec3>) -> Vec3 {
+    pub(crate) fn centre(points: impl IntoIterator<Item = Vec3>) -> Vec3 {
         let (mut low, mut high) = (Vec3::repeat(f64::MAX), Vec3::repeat(f64::MIN));
         for p in points {
             low = low.inf(&p);
             high = high.sup(&p);
         }
-        let middle = 0.5 * (low + high);
-        Vec3::new(middle.x, middle.y, 0.0)
+        let centre = 0.5 * (low + high);
+        Vec3::new(centre.x, centre.y, 0.0)
     }
 }
 

@@ -124,7 +124,7 @@ pub struct Proposals {
     pub held_before: Vec<f64>,
     /// Centres between the pads, transferred from experience to this object, camera frame, with their weights; empty if shapes were
     /// not compared.
-    pub middles: Vec<(Vec3, f64)>,
+    pub grasp_centres: Vec<(Vec3, f64)>,
 }
 
 impl Proposals {
@@ -137,18 +137,20 @@ impl Proposals {
             return 0.0;
         }
         let same = held.iter().map(|&i| self.held_before[i]).sum::<f64>() / held.len() as f64;
-        let weights: f64 = self.middles.iter().map(|m| m.1).sum();
+        let weights: f64 = self.grasp_centres.iter().map(|m| m.1).sum();
         if weights <= 0.0 {
             return same;
         }
-        let middle = centre_between_pads(&grasp.camera_from_gripper);
-        let near = |m: &(Vec3, f64)| m.1 * (-0.5 * (m.0 - middle).norm_squared() / (MIDDLES * MIDDLES)).exp();
-        same * self.middles.iter().map(near).sum::<f64>() / weights
+        let centre = centre_between_pads(&grasp.camera_from_gripper);
+        let near = |m: &(Vec3, f64)| {
+            m.1 * (-0.5 * (m.0 - centre).norm_squared() / (GRASP_CENTRE_SCALE * GRASP_CENTRE_SCALE)).exp()
+        };
+        same * self.grasp_centres.iter().map(near).sum::<f64>() / weights
     }
 }
 
 /// Standard deviation of the centre between the pads around that of the experience, metres.
-const MIDDLES: f64 = 0.02;
+const GRASP_CENTRE_SCALE: f64 = 0.02;
 
 /// Fewest pixels between the pads of a grasp that can be rated.
 pub(super) const FEWEST_HELD: usize = 4;
@@ -201,7 +203,7 @@ pub fn propose(
             let copy = if m.angle == 0.0 {
                 stored.experience.crop.clone()
             } else {
-                stored.experience.crop.turned(m.angle, trim)
+                stored.experience.crop.rotated(m.angle, trim)
             };
             experiences.push((*m, stored, copy));
         }
@@ -209,7 +211,7 @@ pub fn propose(
     experiences.retain(|(_, stored, copy)| copy.side == crop.side && !stored.experience.copies.is_empty());
     if experiences.is_empty() || view.object.is_empty() {
         let held_before = vec![0.0; crop.mask.len()];
-        return Ok(Proposals { nearest, crop, proposals: vec![], held_before, middles: vec![] });
+        return Ok(Proposals { nearest, crop, proposals: vec![], held_before, grasp_centres: vec![] });
     }
     let cloud = IndexedCloud::new(view.object.clone())?;
     let planes: Vec<Vec<f32>> = experiences.iter().map(|(.., copy)| copy.vd_noc_planes()).collect();
@@ -247,12 +249,12 @@ pub fn propose(
         .map(|((from, stored, copy), coordinates)| {
             let e = &stored.experience;
             let region = rotated_region(&e.region, copy);
-            let turned_grasp = turn(from.angle) * e.camera_from_gripper;
+            let rotated_grasp = turn(from.angle) * e.camera_from_gripper;
             let aligned = transfer(&crop, &cloud, coordinates, copy, &region, &options.align);
             aligned
                 .iter()
                 .filter_map(|t| {
-                    let source = Source { copy, grasp: &turned_grasp, opening: e.opening, width: e.width };
+                    let source = Source { copy, grasp: &rotated_grasp, opening: e.opening, width: e.width };
                     let placed = match options.reach {
                         None => place(fitter, gripper, &source, t),
                         Some(reach) => at_distance(fitter, &source, t, reach).map(|g| (g, 0.0, false)),
@@ -270,7 +272,7 @@ pub fn propose(
         })
         .collect();
     let proposals: Vec<Proposal> = found.into_iter().flatten().collect();
-    let mut found = Proposals { nearest, crop, proposals, held_before, middles: vec![] };
+    let mut found = Proposals { nearest, crop, proposals, held_before, grasp_centres: vec![] };
     if options.shapes {
         found.add_shapes(fitter, memory, &in_shapes[..in_shapes.len().min(IN_SHAPES)])?;
     }
@@ -399,7 +401,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_grasp_holds_is_looked_up_between_its_pads() {
+    fn held_surface_is_looked_up_between_the_pads() {
         // A plate of 12 x 4 cm at 0.7 m, whose left third was held in experience.
         let camera = Camera::new(575.0, 575.0, 159.5, 119.5, 320, 240).unwrap();
         let inside = |x: usize, y: usize| (110..209).contains(&x) && (103..136).contains(&y);
@@ -410,7 +412,8 @@ mod tests {
         for i in crop.pixels().filter(|&i| crop.points[i][0] < -0.02) {
             held_before[i] = 0.8;
         }
-        let found = Proposals { nearest: vec![], crop, proposals: vec![], held_before, middles: vec![] };
+        let found =
+            Proposals { nearest: vec![], crop, proposals: vec![], held_before, grasp_centres: vec![] };
         let gripper = Gripper::built_in("jaws-85").unwrap();
         let at = |x: f64| {
             let pose = gripper_pose(&Vec3::new(x, 0.0, 0.72), &Vec3::z(), &Vec3::y()).unwrap();
@@ -429,10 +432,10 @@ mod tests {
             let quality = AntipodalQuality { alignment: 1.0, support: 1.0, centring: 1.0, observed: 1.0 };
             Grasp { camera_from_gripper: pose, opening: 0.06, width: 0.04, quality }
         };
-        let middle = centre_between_pads(&grasp(-0.04).camera_from_gripper);
-        let middles = vec![(middle + Vec3::z() * 0.015, 0.75), (middle + Vec3::x() * 0.3, 0.25)];
-        let found = Proposals { middles, ..found };
-        let share = 0.75 * (-0.5f64 * (0.015f64 / MIDDLES).powi(2)).exp();
+        let centre = centre_between_pads(&grasp(-0.04).camera_from_gripper);
+        let grasp_centres = vec![(centre + Vec3::z() * 0.015, 0.75), (centre + Vec3::x() * 0.3, 0.25)];
+        let found = Proposals { grasp_centres, ..found };
+        let share = 0.75 * (-0.5f64 * (0.015f64 / GRASP_CENTRE_SCALE).powi(2)).exp();
         assert!((found.holds_the_same(&grasp(-0.04), &gripper) - 0.8 * share).abs() < 1e-6);
     }
 }

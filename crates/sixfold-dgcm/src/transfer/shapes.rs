@@ -34,7 +34,7 @@ struct Counterpart {
     /// The held points, in the current camera's frame.
     held: Vec<Vec3>,
     /// The centre between the pads, in the current camera's frame.
-    middle: Vec3,
+    centre: Vec3,
 }
 
 impl Counterpart {
@@ -82,7 +82,7 @@ impl Proposals {
         let mut weights = 0.0;
         for (c, placed) in found.into_iter().zip(placed) {
             let weight = ((c.fit - best) / FIT).exp();
-            self.middles.push((c.middle, weight));
+            self.grasp_centres.push((c.centre, weight));
             if c.held.len() >= FEWEST_HELD {
                 weights += weight;
                 for i in self.crop.pixels() {
@@ -115,14 +115,14 @@ fn counterparts(here: &Shape, from: Match, stored: &Arc<Stored>) -> Vec<Counterp
     let on_table: Vec<Vec3> = held.iter().map(|p| there.table_from_camera.transform_point(p)).collect();
     let tips = centre_between_pads(&e.camera_from_gripper);
     // The centre of the points to be held again.
-    let middle = if held.is_empty() { tips } else { held.iter().sum::<Vec3>() / held.len() as f64 };
+    let centre = if held.is_empty() { tips } else { held.iter().sum::<Vec3>() / held.len() as f64 };
     upright(here, &there, &on_table)
         .into_iter()
         .map(|u| {
             let rotation = u.rotation(&there, here);
-            let to = u.map_camera(&middle, &there, here);
+            let to = u.map_camera(&centre, &there, here);
             let transferred = Transferred {
-                camera_from_experience: rotation.with_translation(to - rotation.transform_point(&middle)),
+                camera_from_experience: rotation.with_translation(to - rotation.transform_point(&centre)),
                 hypothesis: AlignmentHypothesis::Upright,
                 pixels: held.len(),
                 rms: None,
@@ -134,7 +134,7 @@ fn counterparts(here: &Shape, from: Match, stored: &Arc<Stored>) -> Vec<Counterp
                 stored: stored.clone(),
                 transferred,
                 held: held.iter().map(|p| u.map_camera(p, &there, here)).collect(),
-                middle: u.map_camera(&tips, &there, here),
+                centre: u.map_camera(&tips, &there, here),
             }
         })
         .collect()

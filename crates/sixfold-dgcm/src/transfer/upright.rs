@@ -20,7 +20,7 @@ const CLOSER: usize = 8;
 /// Alignments rotated by less than this are the same, radians.
 const SAME: f64 = 0.6;
 /// Penalty of a rotation by 180 degrees, so that for a round object the same side is chosen.
-const TURNED: f64 = 0.01;
+const PENALTY_180: f64 = 0.01;
 
 /// The alignment of an experience's upright object.
 #[derive(Debug, Clone, Copy)]
@@ -76,7 +76,7 @@ impl Upright {
         let here = pair.here.points.iter().zip(&pair.telling_here);
         let back: f64 = here.map(|(p, w)| w * pair.there.at(&self.back(p))).sum();
         let second = back / pair.telling_here.iter().sum::<f64>().max(1e-9);
-        self.fit = 0.5 * (first + second) - 0.5 * TURNED * (1.0 - self.yaw.cos());
+        self.fit = 0.5 * (first + second) - 0.5 * PENALTY_180 * (1.0 - self.yaw.cos());
     }
 }
 
@@ -111,7 +111,7 @@ pub(super) fn upright(here: &Shape, there: &Shape, held: &[Vec3]) -> Vec<Upright
         return vec![];
     }
     let up = (here.height / there.height).clamp(0.5, 2.0);
-    let middle = Shape::middle(here.points.iter().copied());
+    let centre = Shape::centre(here.points.iter().copied());
     let few: Vec<Vec3> = there.points.iter().step_by(3).copied().collect();
     let few_held: Vec<Vec3> = held.iter().step_by(2).copied().collect();
     let ones = |shape: &Shape| vec![1.0; shape.points.len()];
@@ -123,7 +123,7 @@ pub(super) fn upright(here: &Shape, there: &Shape, held: &[Vec3]) -> Vec<Upright
             let mut tried = Upright { yaw, stretch: [stretch, up], shift: Vec3::zeros(), fit: 0.0 };
             let moved: Vec<Vec3> = few.iter().map(|p| tried.map(p)).collect();
             let held: Vec<Vec3> = few_held.iter().map(|p| tried.map(p)).collect();
-            let start = middle - Shape::middle(moved.iter().copied());
+            let start = centre - Shape::centre(moved.iter().copied());
             let mut best = (f64::MIN, start);
             for (x, y) in (-MOVES..=MOVES).flat_map(|y| (-MOVES..=MOVES).map(move |x| (x, y))) {
                 let shift = start + Vec3::new(x as f64, y as f64, 0.0) * 0.01;
@@ -302,7 +302,7 @@ mod tests {
     }
 
     #[test]
-    fn a_handle_tells_more_of_a_turn_than_the_wall() {
+    fn a_handle_determines_the_yaw_better_than_the_wall() {
         let mug = seen(Family::Mug, 31, -0.3);
         let shape = Shape::new(&mug.crop);
         let ones = || vec![1.0; shape.points.len()];
@@ -313,9 +313,9 @@ mod tests {
         let anywhere: Vec<Upright> = (0..TURNS)
             .map(|k| {
                 let yaw = TAU * k as f64 / TURNS as f64;
-                let mut turned = Upright { yaw, stretch: [1.0; 2], shift: Vec3::zeros(), fit: 0.0 };
-                turned.shift = axis - turned.map(&axis);
-                turned
+                let mut rotated = Upright { yaw, stretch: [1.0; 2], shift: Vec3::zeros(), fit: 0.0 };
+                rotated.shift = axis - rotated.map(&axis);
+                rotated
             })
             .collect();
         pair.weigh(&anywhere);
@@ -335,9 +335,9 @@ mod tests {
     #[test]
     fn without_a_table_nothing_is_said() {
         let [a, b] = [1, 2].map(|seed| seen(Family::Mug, seed, 0.0));
-        let lying = Crop { table: None, ..b.crop.clone() };
-        assert!(upright(&Shape::new(&a.crop), &Shape::new(&lying), &[]).is_empty());
-        assert!(upright(&Shape::new(&lying), &Shape::new(&a.crop), &[]).is_empty());
+        let without_table = Crop { table: None, ..b.crop.clone() };
+        assert!(upright(&Shape::new(&a.crop), &Shape::new(&without_table), &[]).is_empty());
+        assert!(upright(&Shape::new(&without_table), &Shape::new(&a.crop), &[]).is_empty());
         assert!(!upright(&Shape::new(&b.crop), &Shape::new(&a.crop), &[]).is_empty());
     }
 }

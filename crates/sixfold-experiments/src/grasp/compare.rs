@@ -41,11 +41,11 @@ pub(crate) struct CompareArguments {
     #[arg(long, value_name = "N", default_value = "15")]
     pub trials: u64,
     /// A harder setting: twice the sensor noise and lost edges, errors of the gripper's pose of 5 mm and 3 degrees (standard
-    /// deviation per axis), friction of 0.25, which the planner does not know, objects of 0.5 kg
+    /// deviation per axis), friction of 0.25, unknown to the planner, objects of 0.5 kg
     #[arg(long)]
     pub hard: bool,
-    /// Number of tries of each grasp, each with another error of the gripper's pose (with --hard, since exact poses repeat):
-    /// more tries reduce chance
+    /// Number of tries of each grasp, each with another error of the gripper's pose; more tries reduce random variation (only with
+    /// --hard: without errors all tries are the same)
     #[arg(long, value_name = "N", default_value = "1")]
     pub tries: usize,
     #[command(flatten)]
@@ -150,7 +150,8 @@ pub(crate) fn compare(a: &CompareArguments) -> Result<Whole> {
     }
     if a.tries == 0 || a.tries > 1 && !a.hard {
         bail!(
-            "--tries: found {}, expected at least 1, and 1 without --hard: an exact hand does the same every time",
+            "--tries: found {}, expected at least 1, and 1 without --hard: without errors of the gripper's \
+             pose all tries are the same",
             a.tries
         );
     }

@@ -219,7 +219,7 @@ fn classes(measured: &[Measured]) -> Vec<Class> {
 
 fn print_table(whole: &Whole) {
     println!(
-        "{:<12} {:>6} {:>6} {:>6} {:>15} {:>9} {:>9}  endings",
+        "{:<12} {:>6} {:>6} {:>6} {:>15} {:>9} {:>9}  outcomes",
         "class", "trials", "held", "rate", "95 % interval", "plan (s)", "trial (s)"
     );
     for c in &whole.classes {

@@ -31,12 +31,12 @@ pub(crate) enum ReproduceCommand {
     /// Measure recall and AR of Pix2Pose per object, the contribution of each part, and times
     #[command(after_help = "Example:\n  \
         sixfold reproduce pix2pose --dataset lmo --frames frames.json --weights model.safetensors --published lmo/published/cnos-fastsam-megapose_lmo-test.csv --out out/reproduce\n\n\
-        Every row is kept. After a stop, the same command resumes.")]
+        Finished rows are kept. After a stop, the same command resumes.")]
     Pix2pose(Box<pix2pose::ReproducePix2PoseArguments>),
     /// Measure masks and poses of template matching per object, with ablations, point pair features and times
     #[command(after_help = "Example:\n  \
         sixfold reproduce mttm --dataset lmo-simulated --out out/reproduce-mttm\n\n\
-        Every image is kept. After a stop, the same command resumes.")]
+        Finished images are kept. After a stop, the same command resumes.")]
     Mttm(mttm::ReproduceMttmArguments),
     /// Measure poses and views of Neural Object Learning, with wrong meshes, under other light, and times
     #[command(after_help = nol::arguments::AFTER_HELP)]
@@ -50,7 +50,7 @@ pub(crate) enum ReproduceCommand {
     /// Measure grasps from experience: table 6.2, figure 6.7, learning from an empty store, handles
     #[command(after_help = "Example:\n  \
         sixfold reproduce dgcm --list benches/grasp-objects.json --meshes DIR --out out/reproduce-dgcm\n\n\
-        Every part is kept. After a stop, the same command resumes.")]
+        Finished parts are kept. After a stop, the same command resumes.")]
     Dgcm(Box<dgcm::ReproduceDgcmArguments>),
 }
 

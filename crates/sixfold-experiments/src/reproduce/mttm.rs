@@ -36,14 +36,14 @@ pub(crate) struct ReproduceMttmArguments {
     /// Split of the dataset
     #[arg(long, default_value = "test")]
     pub split: String,
-    /// Folder of the dataset's models, such as models_cad or models_reconst of T-LESS (default: models, or models_eval without it; for
-    /// scores the other way about)
+    /// Folder of the dataset's models, such as models_cad or models_reconst of T-LESS (default: models, or models_eval without it;
+    /// for scores the reverse)
     #[arg(long, value_name = "FOLDER", value_parser = folder_name)]
     pub models: Option<String>,
     /// Targets file of the dataset (default: its test_targets_bop19.json, or all ground truth)
     #[arg(long, value_name = "FILE")]
     pub targets: Option<PathBuf>,
-    /// Folder for the table, its JSON, and the images done so far
+    /// Folder for the table, its JSON, and the results of finished images
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
     /// Take every N-th image
@@ -231,7 +231,7 @@ pub(crate) fn run(a: &ReproduceMttmArguments, json: &JsonArguments) -> Result<Ou
     let mut progress = Progress::new("images", images.len());
     let mut measured: Vec<Measured> = vec![];
     for ((scene_id, im_id), ids) in &images {
-        check_interrupt("the images done so far are kept; run the same command again to continue")?;
+        check_interrupt("the results of finished images are kept; run the same command again to continue")?;
         let kept = a.out.join("images").join(format!("{scene_id:06}_{im_id:06}.json"));
         if let Ok(text) = std::fs::read_to_string(&kept) {
             measured.push(serde_json::from_str(&text).with_context(|| {
@@ -474,7 +474,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_row_counts_what_was_not_found_as_wrong() {
+    fn a_row_counts_missing_poses_as_wrong() {
         let outcome =
             |object, iou, error| Outcomes { object, iou, error, confidence: None, seconds: [1.0, 0.5] };
         let image = |all: Vec<Outcomes>| Measured::from([("both".to_string(), all)]);
@@ -497,7 +497,7 @@ mod tests {
     }
 
     #[test]
-    fn the_error_is_a_share_of_the_diameter() {
+    fn the_error_is_a_fraction_of_the_diameter() {
         let vertices = vec![Vec3::zeros(), Vec3::x() * 0.1, Vec3::y() * 0.1, Vec3::z() * 0.1];
         let points = ModelPoints::new(&vertices).unwrap();
         let mesh = Mesh::new(vertices, vec![[0, 1, 2], [0, 2, 3]]).unwrap();

@@ -28,7 +28,7 @@ use super::teach_photographs::{board_from_world, errors, marked_length, teaching
 
 pub(super) const AFTER_HELP: &str = "Example:\n  \
     sixfold reproduce teach --list benches/teach-objects.json --meshes DIR --ground photograph.jpg --out out/reproduce-teach\n\n\
-    Every object is kept. After a stop, the same command resumes.";
+    Finished objects are kept. After a stop, the same command resumes.";
 
 /// Angular spatial frequency of the colours given to a mesh without colours, 1/m: patches of a few centimetres.
 const PATCHES: f64 = 90.0;
@@ -57,7 +57,7 @@ pub(crate) struct ReproduceTeachArguments {
     #[arg(long, value_name = "SEED", default_value_t = 7)]
     seed: u64,
     /// The object stands on a patterned cloth of 0.6 m in place of the board; a length of 0.29 m is marked in three photographs,
-    /// to a pixel. New images are not searched
+    /// accurate to a pixel. No new images are searched
     #[arg(long)]
     no_board: bool,
     /// Folder for the results

@@ -20,14 +20,14 @@ use sixfold_shell::Outcome;
 use sixfold_shell::output::{JsonArguments, report, write_atomically};
 use sixfold_shell::progress::{Progress, check_interrupt};
 use sixfold_shell::ranges::in_range;
-use sixfold_teach::{MOST_PHOTOGRAPHS, SalientSegmenter, ShapeOptions, Teaching};
+use sixfold_teach::{MAX_PHOTOGRAPHS, SalientSegmenter, ShapeOptions, Teaching};
 use sixfold_views::estimator::ViewsEstimator;
 
 use super::teach::{compose, mean_millimetres};
 
 pub(super) const AFTER_HELP: &str = "Example:\n  \
     sixfold reproduce teach-dataset --dataset lmo --objects 5 6 8 9 12 --out out/reproduce-teach-dataset\n\n\
-    Every object is kept. After a stop, the same command resumes.";
+    Finished objects are kept. After a stop, the same command resumes.";
 
 /// Minimum visible fraction of an object that is searched in an image, as in the BOP Challenge.
 const VISIBLE_TO_FIND: f64 = 0.1;
@@ -54,13 +54,13 @@ pub(crate) struct TeachDatasetArguments {
     /// Objects to teach, by their ids
     #[arg(long, value_name = "ID", num_args = 1.., required = true)]
     objects: Vec<u32>,
-    /// Images that teach each object, from as different sides as there are
+    /// Number of images from which each object is learned, chosen from viewpoints as different as possible
     #[arg(long, value_name = "N", default_value_t = 16)]
     photographs: usize,
-    /// An image teaches an object of which at least this fraction is visible
+    /// Minimum visible fraction of an object in the images from which it is learned
     #[arg(long, value_name = "FRACTION", default_value_t = 0.5)]
     min_visible: f64,
-    /// Most other images in which each object is searched
+    /// Maximum number of other images in which each object is searched for
     #[arg(long, value_name = "N", default_value_t = 1000)]
     images: usize,
     /// Folder for the results
@@ -136,7 +136,7 @@ impl Seen {
 
 pub(super) fn run(a: &TeachDatasetArguments, json: &JsonArguments) -> Result<Outcome> {
     in_range("--min-visible", a.min_visible, 0.0..=1.0)?;
-    in_range("--photographs", a.photographs, 4..=MOST_PHOTOGRAPHS)?;
+    in_range("--photographs", a.photographs, 4..=MAX_PHOTOGRAPHS)?;
     let dataset = BopDataset::open(&a.dataset, &a.split)?;
     let info = dataset.models_info(Models::Rendering)?.unwrap_or_default();
     let mut meshes = BTreeMap::new();
@@ -366,8 +366,8 @@ fn standing_plane(bodies: &[Vec<Vec3>], eye: &Vec3) -> Option<Plane> {
     // The mean distance from the median, because one body may stand on another.
     let spread = |normal: &Vec3| {
         let mut heights = lowest(normal);
-        let middle = median(&mut heights).unwrap_or(f64::NAN);
-        (heights.iter().map(|h| (h - middle).abs()).sum::<f64>() / heights.len() as f64, middle)
+        let median_height = median(&mut heights).unwrap_or(f64::NAN);
+        (heights.iter().map(|h| (h - median_height).abs()).sum::<f64>() / heights.len() as f64, median_height)
     };
     let mut best = eye.try_normalize(1e-9)?;
     let mut step = FIRST_STEP;

@@ -3,7 +3,7 @@
 use crate::support::*;
 
 #[test]
-fn a_dataset_is_reproduced_and_it_goes_on() {
+fn a_reproduction_resumes() {
     let tiny = Tiny::new(true);
     let dir = tiny.path();
     let reproduce = "reproduce mttm --dataset tiny --out reproduced --json";

@@ -49,7 +49,7 @@ fn the_tables_of_neural_object_learning_are_made_and_kept() {
 }
 
 #[test]
-fn what_cannot_be_reproduced_says_why() {
+fn errors_explain_why_a_reproduction_fails() {
     let tiny = Tiny::coloured();
     let dir = tiny.path();
     let all = r#"[{"scene_id": 7, "im_id": 0}, {"scene_id": 7, "im_id": 4}, {"scene_id": 7, "im_id": 11}]"#;

@@ -24,7 +24,7 @@ pub use refine::{RefineOptions, RefineReport, Trust, refine_pose, refine_trusted
 #[non_exhaustive]
 pub enum PnpError {
     /// The lists have different lengths.
-    #[error("{object_points} object points, {image_points} image points: each needs its partner")]
+    #[error("{object_points} object points, {image_points} image points: expected equal numbers")]
     Lengths {
         /// Length of the first list.
         object_points: usize,
@@ -52,7 +52,7 @@ pub enum PnpError {
         index: usize,
     },
     /// The points lie on one line or at one place.
-    #[error("the {what} lie on one line or in one place: they do not fix a pose")]
+    #[error("the {what} are collinear or coincide: they do not determine a pose")]
     Degenerate {
         /// Which points.
         what: &'static str,

@@ -185,7 +185,7 @@ pub fn refine_trusted(
         return Err(PnpError::Lengths { object_points: trust.len(), image_points: image_points.len() });
     }
     let data = Prepared::new(object_points, image_points, camera)?;
-    if trust.iter().filter(|t| t.weight > LEAST_WEIGHT).count() < 3 {
+    if trust.iter().filter(|t| t.weight > MIN_WEIGHT).count() < 3 {
         return Err(PnpError::NoModel);
     }
     let mut pose = initial.with_translation(initial.transform_point(&data.centre));
@@ -208,7 +208,7 @@ pub fn refine_trusted(
 }
 
 /// Points with a smaller weight are ignored.
-const LEAST_WEIGHT: f64 = 1e-6;
+const MIN_WEIGHT: f64 = 1e-6;
 /// Maximum number of steps of [`refine_trusted`].
 const TRUSTED_STEPS: usize = 20;
 

@@ -107,7 +107,7 @@ fn epnp_with_noise() {
 }
 
 #[test]
-fn a_refinement_follows_what_is_trusted() {
+fn a_refinement_weights_correspondences_by_their_trust() {
     let case = case(5, 200, 0.0, 0.4, false);
     let start = case.truth * Pose::exp(&Vector6::new(0.002, -0.001, 0.01, 0.05, -0.08, 0.04));
     let refined = |of_wrong: Trust| {
@@ -130,7 +130,7 @@ fn a_refinement_follows_what_is_trusted() {
 }
 
 #[test]
-fn refinement_ignores_what_is_beyond_the_threshold() {
+fn refinement_ignores_outliers_beyond_the_threshold() {
     let case = case(5, 200, 0.0, 0.4, false);
     let start = case.truth * Pose::exp(&Vector6::new(0.0005, -0.0003, 0.003, 0.01, -0.02, 0.01));
     let options = RefineOptions::default();

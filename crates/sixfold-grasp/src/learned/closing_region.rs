@@ -208,7 +208,7 @@ mod tests {
     }
 
     #[test]
-    fn the_axes_show_where_the_points_are() {
+    fn the_images_along_each_axis_contain_the_points() {
         let (region, gripper) = images(0.01);
         let at = |channel: usize, x: usize, y: usize| region.pixels()[(channel * SIDE + y) * SIDE + x];
         // Along the approach: at one column, over all rows of the pads' width; normals along x.

@@ -179,7 +179,7 @@ mod tests {
     }
 
     #[test]
-    fn what_no_planner_has_is_named() {
+    fn errors_of_a_planner_file_are_named() {
         let text = write_haf(&model()).unwrap();
         for (before, after, field) in [
             ("haf-linear-1", "haf-linear-2", "kind"),

@@ -143,8 +143,8 @@ pub(super) fn anchor(
         |t: &Template| SeenPatch::of_patch(&TemplateSurface::new(t, drawn_size).patch(0.0, size, side));
     // The region is centred on the object's reference point, even if that is hidden.
     let (low, high) = mesh.bounding_box();
-    let middle = camera_from_object.transform_point(&((low + high) * 0.5));
-    let toward = Roi { centre: middle }.camera_from_roi().inverse() * *camera_from_object;
+    let box_centre = camera_from_object.transform_point(&((low + high) * 0.5));
+    let toward = Roi { centre: box_centre }.camera_from_roi().inverse() * *camera_from_object;
     let exact = draw(toward.rotation())?;
     let reference = |t: &Template| t.view_from_object.inverse().transform_point(&Vec3::zeros());
     let roi = Roi { centre: camera_from_object.transform_point(&reference(&exact)) };
@@ -152,7 +152,7 @@ pub(super) fn anchor(
     let rotation = roi_from_object.rotation();
 
     let kept = options.kept_side();
-    let cells = roi.look(scene, size * kept as f64 / side as f64, kept, |_| true);
+    let cells = roi.cells_on_grid(scene, size * kept as f64 / side as f64, kept, |_| true);
     let mask = looks_at(scene, &roi, size * kept as f64 / side as f64, kept, |p| visible.as_slice()[p]);
     let positives: Vec<Positive> = (0..options.positives)
         .filter_map(|_| {
@@ -194,7 +194,8 @@ pub(super) fn without_object(
     options: &AnchorOptions,
 ) -> Anchor {
     let (size, kept) = (REACH * diameter, options.kept_side());
-    let cells = Roi { centre: *point }.look(scene, size * kept as f64 / options.side as f64, kept, |_| true);
+    let cells =
+        Roi { centre: *point }.cells_on_grid(scene, size * kept as f64 / options.side as f64, kept, |_| true);
     Anchor {
         object: None,
         region: SeenPatch::of_cells(&cells, size, kept),
@@ -212,7 +213,7 @@ fn looks_at(
     side: usize,
     of_kind: impl Fn(usize) -> bool,
 ) -> Vec<bool> {
-    roi.look(scene, size, side, of_kind).iter().map(|c| *c != UNKNOWN).collect()
+    roi.cells_on_grid(scene, size, side, of_kind).iter().map(|c| *c != UNKNOWN).collect()
 }
 
 /// A random rotation as occurs between a view and the templates near it.

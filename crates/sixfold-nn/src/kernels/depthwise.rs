@@ -190,12 +190,13 @@ pub(super) fn depthwise_backward(
     let (pixels, out_pixels) = (shape.pixels(), rows * columns);
     let mut dx = unwritten(if want_x { x.len() } else { 0 });
     // With a stride of one the input gradient is a convolution of the gradient with the flipped kernel.
-    let turned = spec.stride == 1 && spec.padding.iter().all(|p| *p < shape.kernel);
-    let turned_spec =
+    let use_flipped = spec.stride == 1 && spec.padding.iter().all(|p| *p < shape.kernel);
+    let flipped_spec =
         ConvSpec { padding: spec.padding.map(|p| (shape.kernel - 1).saturating_sub(p)), ..*spec };
-    let turned_shape = ConvShape { size: [rows, columns], ..*shape };
-    let turned_padded = Padded::new(&turned_shape, &turned_spec);
-    let turned_starts = if turned { taps(&turned_padded, shape.kernel, shape.size[0]) } else { Vec::new() };
+    let flipped_shape = ConvShape { size: [rows, columns], ..*shape };
+    let flipped_padded = Padded::new(&flipped_shape, &flipped_spec);
+    let flipped_starts =
+        if use_flipped { taps(&flipped_padded, shape.kernel, shape.size[0]) } else { Vec::new() };
     let shared = Shared::new(&mut dx);
     let starts = taps(&padded, shape.kernel, rows);
     // Rows of the gradient, padded with zeros to whole vectors.
@@ -207,13 +208,13 @@ pub(super) fn depthwise_backward(
             || {
                 (
                     vec![0.0; padded.len()],
-                    vec![0.0; padded.len().max(turned_padded.len())],
+                    vec![0.0; padded.len().max(flipped_padded.len())],
                     vec![0.0; rows * wide],
                 )
             },
             |(buffer, dbuffer, gradient), channel| {
                 let weight = &weight[channel * area..][..area];
-                let turned_weight: Vec<f32> = weight.iter().rev().copied().collect();
+                let flipped_weight: Vec<f32> = weight.iter().rev().copied().collect();
                 let mut dweight = vec![0.0; area];
                 let mut dbias = 0.0;
                 for b in 0..shape.batch {
@@ -235,15 +236,15 @@ pub(super) fn depthwise_backward(
                         // SAFETY: every channel of every image belongs to one task.
                         #[allow(unsafe_code)]
                         let dx = unsafe { shared.slice(plane * pixels, pixels) };
-                        if turned {
+                        if use_flipped {
                             for (y, g) in gradient.chunks_exact(wide).enumerate() {
-                                let start = turned_padded.start(y + turned_spec.padding[0], 0)
-                                    + turned_spec.padding[0];
+                                let start = flipped_padded.start(y + flipped_spec.padding[0], 0)
+                                    + flipped_spec.padding[0];
                                 dbuffer[start..start + columns].copy_from_slice(&g[..columns]);
                             }
                             let lines =
-                                dx.chunks_exact_mut(shape.size[1]).zip(turned_starts.chunks_exact(area));
-                            lines.for_each(|(dx, starts)| row(dx, dbuffer, starts, &turned_weight, 0.0));
+                                dx.chunks_exact_mut(shape.size[1]).zip(flipped_starts.chunks_exact(area));
+                            lines.for_each(|(dx, starts)| row(dx, dbuffer, starts, &flipped_weight, 0.0));
                         } else {
                             dbuffer.fill(0.0);
                             input_gradient(dbuffer, gradient, wide, weight, &starts);

@@ -184,7 +184,7 @@ mod tests {
     }
 
     #[test]
-    fn it_is_what_the_definition_says() {
+    fn it_agrees_with_the_definition() {
         let size = [10, 12];
         let map: Vec<f32> = (0..2 * 120).map(|i| ((i * i) as f32 * 0.37).sin()).collect();
         for samples in [Some(2), None, Some(3)] {

@@ -36,7 +36,7 @@ fn network() -> SalientNetwork {
 /// `checks/salient_vs_onnxruntime.py` compares whole maps in full precision to 1e-4; the shipped weights are rounded to half
 /// precision.
 #[test]
-fn the_shipped_weights_see_what_onnxruntime_sees() {
+fn the_built_in_weights_agree_with_onnxruntime() {
     let seen = network().salience(&disk()).unwrap();
     for (x, y, value) in EXPECTED {
         let found = seen.probability[(x, y)];
@@ -46,7 +46,7 @@ fn the_shipped_weights_see_what_onnxruntime_sees() {
 }
 
 #[test]
-fn a_rectangle_is_seen_alone_and_put_where_it_is() {
+fn a_rectangle_is_segmented_alone_and_placed_in_the_image() {
     let network = network();
     let image = disk();
     let rect = Rect { x: 90.2, y: 40.0, width: 180.0, height: 200.0 };

@@ -213,7 +213,7 @@ mod tests {
     }
 
     #[test]
-    fn weights_add_up_and_what_is_not_seen_has_none() {
+    fn weights_add_up_and_are_zero_where_unseen() {
         let device = Device::flex();
         for integrator in [IntegratorKind::Lstm, IntegratorKind::Average] {
             let parts = Parts { integrator, decoder: true };

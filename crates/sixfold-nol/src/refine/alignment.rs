@@ -8,7 +8,7 @@ use sixfold_align::outline::{Outline, color_odds};
 use sixfold_geometry::{Pose, Progress, Vec3};
 use sixfold_mesh::Mesh;
 
-use super::appearance::{Common, Light, Shown, look};
+use super::appearance::{Common, Light, PointSamples, sample_points};
 use super::arrangement::{Arrangement, Wanted};
 use super::common_error::Shared;
 use super::gauss_newton::PosedSource;
@@ -271,29 +271,29 @@ fn parts(pairs: &[[usize; 2]], images: usize, places: usize) -> usize {
 }
 
 /// The colours of all sources, adjusted to a common light.
-pub(super) struct AllShown {
-    pub shown: Vec<Shown>,
+pub(super) struct ObjectSamples {
+    pub shown: Vec<PointSamples>,
     /// Per source: the mean colours of the other sources of its object, and their total weight.
     pub others: Vec<(Vec<f32>, Vec<f32>)>,
 }
 
 /// Colours of all sources at all points of their objects.
-pub(super) fn shown(working: &mut [Working<'_>], maps: &[Maps], objects: &[Object]) -> AllShown {
-    let mut all = AllShown { shown: vec![], others: vec![] };
-    all.shown.resize_with(working.len(), Shown::default);
+pub(super) fn shown(working: &mut [Working<'_>], maps: &[Maps], objects: &[Object]) -> ObjectSamples {
+    let mut all = ObjectSamples { shown: vec![], others: vec![] };
+    all.shown.resize_with(working.len(), PointSamples::default);
     all.others.resize_with(working.len(), Default::default);
     for object in objects {
-        let raw: Vec<Shown> = object
+        let raw: Vec<PointSamples> = object
             .sources
             .par_iter()
             .map(|k| {
                 let w = &working[*k];
-                look(&w.view, &maps[*k], &w.allowed, &object.points, &object.normals)
+                sample_points(&w.view, &maps[*k], &w.allowed, &object.points, &object.normals)
             })
             .collect();
         // The first round fits each source's light, the second computes the colours with it.
         for round in 0..2 {
-            let lit: Vec<Shown> = raw
+            let lit: Vec<PointSamples> = raw
                 .par_iter()
                 .zip(&object.sources)
                 .map(|(raw, k)| {

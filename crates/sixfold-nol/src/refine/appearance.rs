@@ -10,34 +10,35 @@ use crate::source::SourceView;
 
 /// Values of one photograph at every point: channels, and a weight (0: not visible).
 #[derive(Debug, Clone, Default)]
-pub(crate) struct Shown {
+pub(crate) struct PointSamples {
     /// `points * channels` numbers.
     pub values: Vec<f32>,
     pub weights: Vec<f32>,
 }
 
 /// Samples one photograph at all points at its current pose, where `allowed` (0 to 1 per pixel of the crop) permits.
-pub(crate) fn look(
+pub(crate) fn sample_points(
     view: &SourceView,
     maps: &Maps,
     allowed: &[f32],
     points: &[Vec3],
     normals: &[Vec3],
-) -> Shown {
-    look_at(view, view.camera_from_object(), maps, allowed, points, normals)
+) -> PointSamples {
+    sample_points_at(view, view.camera_from_object(), maps, allowed, points, normals)
 }
 
 /// The same with a pose near the current one.
-pub(crate) fn look_at(
+pub(crate) fn sample_points_at(
     view: &SourceView,
     pose: &Pose,
     maps: &Maps,
     allowed: &[f32],
     points: &[Vec3],
     normals: &[Vec3],
-) -> Shown {
+) -> PointSamples {
     let channels = maps.channels();
-    let mut shown = Shown { values: vec![0.0; points.len() * channels], weights: vec![0.0; points.len()] };
+    let mut shown =
+        PointSamples { values: vec![0.0; points.len() * channels], weights: vec![0.0; points.len()] };
     let side = view.side();
     for (i, (point, normal)) in points.iter().zip(normals).enumerate() {
         let Some(([x, y], cosine)) = view.see_at(pose, point, normal) else { continue };
@@ -67,7 +68,7 @@ impl Light {
     }
 
     /// Least squares of `common` on `shown`, regularised towards no change.
-    pub(crate) fn fit(shown: &Shown, common: &[f32], common_weights: &[f32], channels: usize) -> Self {
+    pub(crate) fn fit(shown: &PointSamples, common: &[f32], common_weights: &[f32], channels: usize) -> Self {
         let mut light = Light::neutral(channels);
         for c in 0..channels {
             // Sums over points: weight, x, y, xx, xy.
@@ -118,12 +119,12 @@ pub(crate) struct Common {
     channels: usize,
 }
 
-/// Difference in colour (of 0 to 1, root of the mean square over channels) at which a photograph counts half.
+/// Difference in colour (of 0 to 1, root of the mean square over channels) at which a photograph has a quarter of its weight.
 const FAR: f32 = 0.08;
 
 impl Common {
     /// From values that were adjusted to a common light.
-    pub(crate) fn new(shown: &[Shown], channels: usize) -> Self {
+    pub(crate) fn new(shown: &[PointSamples], channels: usize) -> Self {
         let points = shown.first().map_or(0, |s| s.weights.len());
         let mut common = Common {
             sums: vec![0.0; points * channels],
@@ -175,7 +176,7 @@ impl Common {
     }
 
     /// The mean of all photographs but one, and their total weight.
-    pub(crate) fn without(&self, k: usize, shown: &Shown) -> (Vec<f32>, Vec<f32>) {
+    pub(crate) fn without(&self, k: usize, shown: &PointSamples) -> (Vec<f32>, Vec<f32>) {
         let mut mean = self.sums.clone();
         let mut weights = self.weights.clone();
         for (i, part) in self.parts[k].iter().enumerate() {

@@ -68,12 +68,12 @@ impl Arrangement {
         let mut h = DMatrix::<f64>::zeros(size, size);
         let mut g = DVector::<f64>::zeros(size);
         // Cameras rotate about the centre of the objects in their image, so that rotations and translations are almost decoupled.
-        let mut middles = vec![(Vec3::zeros(), 0.0); images];
+        let mut centroids = vec![(Vec3::zeros(), 0.0); images];
         for (wanted, [image, _]) in wanted.iter().zip(&self.pairs) {
-            middles[*image].0 += wanted.centre;
-            middles[*image].1 += 1.0;
+            centroids[*image].0 += wanted.centre;
+            centroids[*image].1 += 1.0;
         }
-        let middles: Vec<Vec3> = middles.into_iter().map(|(sum, n)| sum / f64::max(n, 1.0)).collect();
+        let centroids: Vec<Vec3> = centroids.into_iter().map(|(sum, n)| sum / f64::max(n, 1.0)).collect();
         let mut centres = vec![Vec3::zeros(); objects];
         for (wanted, &[image, object]) in wanted.iter().zip(&self.pairs) {
             centres[object] = self.camera_from_scene[image].inverse().transform_point(&wanted.centre);
@@ -83,7 +83,7 @@ impl Arrangement {
             let camera = &self.camera_from_scene[image];
             // A rotation of the camera about this centre also moves the object's centre.
             let mut by_camera = Matrix6::identity();
-            let arm = (wanted.centre - middles[image]).cross_matrix();
+            let arm = (wanted.centre - centroids[image]).cross_matrix();
             by_camera.fixed_view_mut::<3, 3>(0, 3).copy_from(&-arm);
             let rotation: Matrix3<f64> = camera.rotation_matrix();
             let mut by_object = Matrix6::zeros();
@@ -113,15 +113,15 @@ impl Arrangement {
             return false;
         }
         let twist = |at: usize| -> Vector6<f64> { step.fixed_rows::<6>(at).into_owned() };
-        let turned = |pose: &Pose, about: Vec3, twist: Vector6<f64>| {
+        let rotated = |pose: &Pose, about: Vec3, twist: Vector6<f64>| {
             let about = Pose::from_translation(about);
             about * Pose::exp(&twist) * about.inverse() * *pose
         };
-        for (i, (camera, middle)) in self.camera_from_scene.iter_mut().zip(middles).enumerate() {
-            *camera = turned(camera, middle, twist(6 * i));
+        for (i, (camera, centroid)) in self.camera_from_scene.iter_mut().zip(centroids).enumerate() {
+            *camera = rotated(camera, centroid, twist(6 * i));
         }
         for (o, (place, centre)) in self.scene_from_object.iter_mut().zip(centres).enumerate() {
-            *place = turned(place, centre, twist(6 * (images + o)));
+            *place = rotated(place, centre, twist(6 * (images + o)));
         }
         true
     }
@@ -132,7 +132,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn one_step_brings_cameras_and_objects_to_where_their_images_want_them() {
+    fn one_step_brings_cameras_and_objects_to_the_optimum() {
         let pairs = vec![[0, 0], [0, 1], [1, 0], [1, 1], [2, 0], [2, 1]];
         let camera = |x: f64, yaw: f64| Pose::exp(&[x, 0.02 * x, 0.8, 0.3, yaw, 0.1 * yaw].into());
         let cameras = [camera(0.1, 0.2), camera(-0.2, -0.5), camera(0.0, 1.0)];

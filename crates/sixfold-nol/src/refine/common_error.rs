@@ -10,7 +10,7 @@ use rayon::prelude::*;
 use sixfold_geometry::nalgebra::{Matrix6, Vector6};
 use sixfold_geometry::{Pose, Vec3};
 
-use super::appearance::{Common, Shown, look_at};
+use super::appearance::{Common, PointSamples, sample_points_at};
 use super::measure::Working;
 use super::options::PoseRefinementOptions;
 use crate::maps::Maps;
@@ -36,14 +36,14 @@ impl Shared<'_, '_> {
         about * Pose::exp(twist) * about.inverse()
     }
 
-    fn shown(&self, twist: &Vector6<f64>) -> Vec<Shown> {
+    fn shown(&self, twist: &Vector6<f64>) -> Vec<PointSamples> {
         let motion = self.motion(twist);
         self.working
             .par_iter()
             .zip(&self.maps)
             .map(|(w, maps)| {
                 let pose = w.pose * motion;
-                let mut shown = look_at(&w.view, &pose, maps, &w.allowed, self.points, self.normals);
+                let mut shown = sample_points_at(&w.view, &pose, maps, &w.allowed, self.points, self.normals);
                 w.light.apply(&mut shown.values);
                 shown
             })
@@ -77,8 +77,8 @@ impl Shared<'_, '_> {
             if squares.is_empty() {
                 return 1.0;
             }
-            let middle = squares.len() / 2;
-            (*squares.select_nth_unstable_by(middle, f64::total_cmp).1).sqrt().max(0.01)
+            let half = squares.len() / 2;
+            (*squares.select_nth_unstable_by(half, f64::total_cmp).1).sqrt().max(0.01)
         });
         let (mut sum, mut weight) = (0.0, 0.0);
         for (square, w) in rows.iter().flatten() {

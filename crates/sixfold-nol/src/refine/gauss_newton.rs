@@ -131,8 +131,8 @@ fn drop_strangers(
     if differences.len() < 4 {
         return;
     }
-    let middle = differences.len() / 2;
-    let median = *differences.select_nth_unstable_by(middle, f64::total_cmp).1;
+    let half = differences.len() / 2;
+    let median = *differences.select_nth_unstable_by(half, f64::total_cmp).1;
     let most = (options.max_different * median).max(MIN_STRANGE);
     for k in sources {
         let report = &mut reports[*k];

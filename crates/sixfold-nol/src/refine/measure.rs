@@ -182,8 +182,8 @@ impl Working<'_> {
             return;
         }
         let mut sizes: Vec<f64> = rows.iter().map(|r| r.residual.abs()).collect();
-        let middle = sizes.len() / 2;
-        let noise = (1.4826 * *sizes.select_nth_unstable_by(middle, f64::total_cmp).1).max(0.01);
+        let half = sizes.len() / 2;
+        let noise = (1.4826 * *sizes.select_nth_unstable_by(half, f64::total_cmp).1).max(0.01);
         let total: f64 = rows.iter().map(|r| r.weight).sum();
         let scale = options.colors / total / (noise * noise);
         for row in &rows {

@@ -17,7 +17,7 @@ mod stillness;
 #[cfg(test)]
 pub(crate) mod tests;
 
-pub(crate) use appearance::{Common, Light, Shown, look};
+pub(crate) use appearance::{Common, Light, PointSamples, sample_points};
 pub use gauss_newton::{PosedSource, refine_poses, refine_scene};
 pub use options::{PoseRefinementOptions, Refinement, SceneKind, SourceReport};
 pub use published::PublishedRuleOptions;

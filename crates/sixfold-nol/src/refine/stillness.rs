@@ -124,8 +124,8 @@ impl MotionTest<'_> {
             best = better;
         }
         // Two of many sometimes agree by chance.
-        let least = if both.len() < 5 { 2 } else { 3.max(both.len() * 2 / 5) };
-        (best.len() >= least).then(|| (self.mean(&best), best.len()))
+        let minimum = if both.len() < 5 { 2 } else { 3.max(both.len() * 2 / 5) };
+        (best.len() >= minimum).then(|| (self.mean(&best), best.len()))
     }
 }
 
@@ -236,7 +236,7 @@ mod tests {
     }
 
     #[test]
-    fn an_object_alone_says_nothing() {
+    fn a_single_object_gives_no_evidence() {
         let pairs = [[0, 0], [1, 0], [2, 0]];
         let places = Places::new(
             &pairs,

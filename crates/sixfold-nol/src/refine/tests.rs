@@ -136,7 +136,7 @@ fn between(turn: f64, away: f64) -> Pose {
 }
 
 #[test]
-fn objects_that_stood_still_share_their_cameras() {
+fn static_objects_share_their_cameras() {
     let (mesh, truth, first, second) = two_blocks(|_| between(1.0, 0.15));
     let sources = sources(&first, &second);
     // The second block has no texture: only the common arrangement remains.
@@ -155,7 +155,7 @@ fn objects_that_stood_still_share_their_cameras() {
 }
 
 #[test]
-fn objects_that_were_moved_once_share_their_cameras_before_and_after() {
+fn objects_moved_once_share_their_cameras_before_and_after() {
     let (mesh, truth, first, second) =
         two_blocks(|image| if image < 5 { between(1.0, 0.15) } else { between(-0.4, -0.1) });
     let sources = sources(&first, &second);

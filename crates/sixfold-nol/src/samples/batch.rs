@@ -18,7 +18,7 @@ const VISIBLE: f32 = 0.5;
 
 /// The pixels of a source that show points of a target.
 #[derive(Debug, Clone, Default)]
-pub struct Looked {
+pub struct Lookup {
     /// Numbers of the target's points that the source shows.
     pub points: Vec<u32>,
     /// Pixels of the source.
@@ -27,7 +27,7 @@ pub struct Looked {
     pub cosines: Vec<f32>,
 }
 
-impl Looked {
+impl Lookup {
     /// How much of the target the source shows: the sum of the cosines.
     pub fn worth(&self) -> f32 {
         self.cosines.iter().sum()
@@ -35,23 +35,23 @@ impl Looked {
 }
 
 /// Projects a target into a source; pixels outside the source's mask are not visible.
-pub(crate) fn look_up(source: &SourceView, target: &TargetSurface) -> Looked {
-    let mut looked = Looked::default();
+pub(crate) fn look_up(source: &SourceView, target: &TargetSurface) -> Lookup {
+    let mut lookup = Lookup::default();
     for (i, (point, normal)) in target.points.iter().zip(&target.normals).enumerate() {
         let Some((pixel, cosine)) = source.see(point, normal) else { continue };
         if source.visible.sample(pixel[0], pixel[1]) >= VISIBLE {
-            looked.points.push(i as u32);
-            looked.pixels.push(pixel);
-            looked.cosines.push(cosine);
+            lookup.points.push(i as u32);
+            lookup.pixels.push(pixel);
+            lookup.cosines.push(cosine);
         }
     }
-    looked
+    lookup
 }
 
 /// Order in which sources are integrated: an LSTM remembers the last one best, so the one that shows most is last.
-pub(crate) fn order(looked: &[Looked]) -> Vec<usize> {
-    let mut order: Vec<usize> = (0..looked.len()).collect();
-    order.sort_by(|a, b| looked[*a].worth().total_cmp(&looked[*b].worth()));
+pub(crate) fn order(lookup: &[Lookup]) -> Vec<usize> {
+    let mut order: Vec<usize> = (0..lookup.len()).collect();
+    order.sort_by(|a, b| lookup[*a].worth().total_cmp(&lookup[*b].worth()));
     order
 }
 
@@ -165,11 +165,11 @@ impl Batch {
             cosines: vec![0.0; all * pixels],
             target: samples.iter().flat_map(|s| s.target.data.iter().map(|v| 2.0 * v - 1.0)).collect(),
         };
-        let looked: Vec<Vec<Looked>> = samples
+        let lookup: Vec<Vec<Lookup>> = samples
             .iter()
             .map(|s| s.sources.iter().map(|source| look_up(source, &s.surface)).collect())
             .collect();
-        let orders: Vec<Vec<usize>> = looked.iter().map(|l| order(l)).collect();
+        let orders: Vec<Vec<usize>> = lookup.iter().map(|l| order(l)).collect();
         let mut images = Vec::with_capacity(all);
         for k in 0..sources {
             for (b, sample) in samples.iter().enumerate() {
@@ -178,11 +178,11 @@ impl Batch {
                     (side, sources),
                     "samples of one kind"
                 );
-                let (source, looked) = (&sample.sources[orders[b][k]], &looked[b][orders[b][k]]);
+                let (source, lookup) = (&sample.sources[orders[b][k]], &lookup[b][orders[b][k]]);
                 batch.images.extend(source.patch.data.iter().map(|v| 2.0 * v - 1.0));
                 let n = k * count + b;
-                let mut places = Vec::with_capacity(looked.points.len());
-                for ((point, pixel), cosine) in looked.points.iter().zip(&looked.pixels).zip(&looked.cosines)
+                let mut places = Vec::with_capacity(lookup.points.len());
+                for ((point, pixel), cosine) in lookup.points.iter().zip(&lookup.pixels).zip(&lookup.cosines)
                 {
                     let at = sample.surface.pixels[*point as usize];
                     places.push(SampledPixel {

@@ -9,7 +9,7 @@ mod object;
 mod view;
 
 pub(crate) use batch::look_up;
-pub use batch::{Batch, Looked, ViewBatchOptions};
+pub use batch::{Batch, Lookup, ViewBatchOptions};
 pub(crate) use batch::{order, share};
 pub use object::PaintedObject;
 pub use view::{Sample, ViewSampleOptions, make_sample};

@@ -93,7 +93,7 @@ pub fn make_sample(
         shininess: uniform(random, [8.0, 60.0]),
     };
     // Either the object is fixed and the camera moves around it, or the object rotates under a fixed lamp.
-    let turned = random.random::<f64>() < 0.3;
+    let object_rotates = random.random::<f64>() < 0.3;
 
     let from = direction(random);
     let pose = seen_from(&from, options, random);
@@ -109,8 +109,11 @@ pub fn make_sample(
             let near = between(random, 0.3, 2.0);
             let from = (from * near + around).try_normalize(1e-6).unwrap_or(around);
             let pose = seen_from(&from, options, random);
-            let towards =
-                if turned { direction(random) } else { lamp.towards + random_direction(random) * 0.3 };
+            let towards = if object_rotates {
+                direction(random)
+            } else {
+                lamp.towards + random_direction(random) * 0.3
+            };
             let lamp = Lamp {
                 towards: towards.try_normalize(1e-6).unwrap_or(lamp.towards),
                 ambient: lamp.ambient * uniform(random, [0.85, 1.15]),

@@ -150,9 +150,9 @@ fn the_candidate_with_most_inliers_wins() {
     let mut lopsided = prediction(&truth());
     ball(&lopsided).into_iter().filter(|i| i % SIDE < 28).for_each(|i| lopsided.visible[i] = 0.0);
     let mut small = prediction(&truth());
-    let middle = SIDE as isize / 2;
+    let mid = SIDE as isize / 2;
     for i in ball(&small) {
-        let (x, y) = ((i % SIDE) as isize - middle, (i / SIDE) as isize - middle);
+        let (x, y) = ((i % SIDE) as isize - mid, (i / SIDE) as isize - mid);
         if x * x + y * y > 100 {
             small.visible[i] = 0.0;
         }

@@ -6,7 +6,7 @@ use super::options::SampleOptions;
 use super::second_stage;
 use super::symmetry::canonical;
 use super::targets::{synchronise, targets};
-use super::window::{Extent, rotated_pixel, turned, window_around};
+use super::window::{Extent, rotated, rotated_pixel, window_around};
 use rand::RngExt;
 use sixfold_data::{
     DEFAULT_CAMERA, PoseRange, PosedImage, PreparedMesh, TrainingObject, color_patch, colors,
@@ -179,7 +179,7 @@ impl SampleSource {
         let crop = &object.real[random.random_range(0..object.real.len())];
         let camera = crop.camera();
         let turn = f64::from(uniform(random, [-options.rotation, options.rotation]));
-        let pose = turned(crop.camera_from_object(), turn);
+        let pose = rotated(crop.camera_from_object(), turn);
         let of_visible = || Extent::of(crop.outline().iter().map(|p| rotated_pixel(camera, p, turn)));
         let whole = object.extent(camera, &pose);
         let extent =

@@ -146,7 +146,7 @@ fn inner(sample: &Sample, target: usize, margin: usize) -> Vec<(usize, usize)> {
 }
 
 #[test]
-fn turned_crops_show_the_coordinates_that_are_to_be_learnt() {
+fn rotated_crops_match_their_target_coordinates() {
     let source = source(SampleOptions { render_share: 0.0, ..plain() });
     let (mut count, mut worst, mut sum) = (0, 0.0f32, 0.0);
     for number in 0..60 {
@@ -222,7 +222,7 @@ fn render_colors_follow_the_coordinates() {
 }
 
 #[test]
-fn a_coordinate_projects_to_its_pixel_and_lies_on_the_surface() {
+fn a_coordinate_projects_to_its_pixel_and_is_on_the_surface() {
     let mesh = colored_box();
     let (low, high) = mesh.bounding_box();
     let scale = BoundingBoxScale::of_corners(&low, &high);
@@ -261,7 +261,7 @@ fn occluders_change_what_is_visible_and_nothing_else() {
 }
 
 #[test]
-fn what_is_left_of_a_cut_object_fills_the_crop_as_a_whole_one_does() {
+fn a_truncated_object_fills_the_crop_like_a_whole_one() {
     let still = SampleOptions { centre_jitter: 0.0, size_jitter: 0.0, ..plain() };
     let whole = source(SampleOptions { render_share: 1.0, visible_box_probability: 1.0, ..still.clone() });
     let cut = source(SampleOptions {
@@ -365,7 +365,7 @@ fn both_stages_in_blocks_or_mixed() {
 }
 
 #[test]
-fn a_freely_turning_object_has_one_target() {
+fn a_continuous_symmetry_has_one_target() {
     let pose = poses()[0];
     let mut turning = object(7, colored_box());
     let symmetry = ContinuousSymmetry { axis: Vec3::z(), offset: Vec3::new(0.01, -0.02, 0.0) };
@@ -400,7 +400,7 @@ fn error_of(objects: Vec<TrainingObject>, real: Vec<PosedImage>, options: Sample
 }
 
 #[test]
-fn what_cannot_be_trained_is_said() {
+fn errors_explain_why_training_is_impossible() {
     let gray = |mesh: &Mesh| Mesh::new(mesh.vertices().to_vec(), mesh.faces().to_vec()).unwrap();
     let mesh = colored_box();
     let default = SampleOptions::default;
@@ -465,7 +465,7 @@ fn photographs_that_do_not_fit_are_refused() {
 }
 
 #[test]
-fn a_texture_is_drawn_also_when_the_mesh_is_simplified() {
+fn a_texture_is_rendered_also_on_a_simplified_mesh() {
     let mesh = colored_box();
     let corners = vec![[0.5f32, 0.5]; mesh.vertices().len()];
     let textured = mesh.with_texture(corners, RgbImage::filled(4, 4, [200, 0, 0])).unwrap();
@@ -481,7 +481,7 @@ fn a_texture_is_drawn_also_when_the_mesh_is_simplified() {
 }
 
 #[test]
-fn published_samples_are_photographs_on_backgrounds_with_the_stages_in_turns() {
+fn published_samples_are_photographs_on_backgrounds_with_alternating_stages() {
     let published = SampleOptions::published(50);
     assert_eq!(published.color, sixfold_synth::augment::ColorAugmentation::table_3_2());
     assert_eq!((published.second_stage_block, published.render_share), (Some(50), 0.0));

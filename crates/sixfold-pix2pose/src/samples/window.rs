@@ -89,7 +89,7 @@ pub(super) fn window_around(extent: &Extent, options: &SampleOptions, random: &m
 }
 
 /// The scene rotated about the camera's axis.
-pub(super) fn turned(pose: &Pose, turn: f64) -> Pose {
+pub(super) fn rotated(pose: &Pose, turn: f64) -> Pose {
     Pose::new(UnitQuaternion::from_axis_angle(&Vec3::z_axis(), turn), Vec3::zeros()) * *pose
 }
 
@@ -105,12 +105,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn crop_pixels_and_the_turned_scene_agree() {
+    fn crop_pixels_agree_with_the_rotated_scene() {
         let camera = Camera::new(572.4, 540.0, 325.3, 242.0, 640, 480).unwrap();
         let point = Vec3::new(0.11, -0.07, 0.9);
         let turn = 0.7;
         let window = Window { centre: Vec2::new(290.0, 310.0), side: 137.0 };
-        let rotated_point = turned(&Pose::from_translation(point), turn).translation();
+        let rotated_point = rotated(&Pose::from_translation(point), turn).translation();
         let in_crop = window.camera(&camera, 64).project(&rotated_point).unwrap();
         let [x, y] = window.map(&camera, 64, turn).apply(in_crop.x as f32, in_crop.y as f32);
         let expected = camera.project(&point).unwrap();

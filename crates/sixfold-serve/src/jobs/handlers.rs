@@ -33,11 +33,11 @@ pub(crate) struct JobView {
     kind: JobKind,
     state: JobState,
     progress: Progress,
-    /// Jobs that wait before this one, while it waits.
+    /// Number of jobs ahead of this one, while it waits.
     ahead: Option<usize>,
-    /// When it came, seconds since 1970.
+    /// When it was received, seconds since 1970.
     created: f64,
-    /// When a worker began with it.
+    /// When a worker started it.
     started: Option<f64>,
     /// When it ended.
     finished: Option<f64>,
@@ -46,7 +46,7 @@ pub(crate) struct JobView {
     links: JobLinks,
 }
 
-/// Where more of a job is.
+/// Links of a job.
 #[derive(Debug, Serialize, ToSchema)]
 pub(crate) struct JobLinks {
     /// The job itself.
@@ -122,9 +122,9 @@ pub(crate) async fn get_job(State(app): Shared, Path(id): Path<String>) -> Answe
 
 /// Removes a finished job with its files and result.
 #[utoipa::path(delete, path = "/v1/jobs/{id}", tag = "jobs", params(("id" = String, Path, description = "Its id")), responses(
-    (status = 204, description = "It is gone"),
+    (status = 204, description = "Removed"),
     (status = 404, description = "There is no such job", body = Problem),
-    (status = 409, description = "It is not finished", body = Problem),
+    (status = 409, description = "The job has not finished", body = Problem),
 ))]
 pub(crate) async fn delete_job(State(app): Shared, Path(id): Path<String>) -> Answer<StatusCode> {
     app.blocking(move |app| app.jobs.remove(&id)).await?;
@@ -158,7 +158,7 @@ pub(crate) struct Waiting {
     (status = 202, description = "The job is not finished: ask again", body = JobView),
     (status = 404, description = "There is no such job", body = Problem),
     (status = 409, description = "The job was cancelled", body = Problem),
-    (status = 422, description = "The job failed: the images do not show what the method works on", body = Problem),
+    (status = 422, description = "The job failed: the images do not contain what the method needs", body = Problem),
 ))]
 pub(crate) async fn job_result(
     State(app): Shared,

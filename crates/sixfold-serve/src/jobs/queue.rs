@@ -189,7 +189,7 @@ impl Jobs {
         self.state().by_number.values().rev().cloned().collect()
     }
 
-    /// How many jobs wait before this one, if it waits.
+    /// Number of jobs ahead of this one, if it waits.
     pub fn ahead(&self, job: &Job) -> Option<usize> {
         let state = self.state();
         (job.state() == JobState::Queued)
@@ -411,7 +411,7 @@ mod tests {
     }
 
     #[test]
-    fn what_ran_or_waited_when_the_server_ended_waits_again_three_times() {
+    fn interrupted_jobs_are_queued_again_three_times() {
         let dir = tempfile::tempdir().unwrap();
         let (first, second) = {
             let jobs = open(dir.path());

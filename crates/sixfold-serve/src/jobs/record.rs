@@ -28,13 +28,13 @@ pub(crate) enum JobKind {
     Teach,
 }
 
-/// How far a job is.
+/// Progress of a job.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum JobState {
     /// It waits for a worker.
     Queued,
-    /// It is worked on.
+    /// A worker processes it.
     Running,
     /// There is a result.
     Done,
@@ -45,7 +45,7 @@ pub(crate) enum JobState {
 }
 
 impl JobState {
-    /// Whether nothing more will happen.
+    /// Whether it has ended.
     pub fn is_final(self) -> bool {
         !matches!(self, JobState::Queued | JobState::Running)
     }
@@ -54,11 +54,11 @@ impl JobState {
 /// The steps of a running job.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 pub(crate) struct Progress {
-    /// Steps that are done.
+    /// Finished steps.
     pub done: usize,
-    /// Steps in all.
+    /// Total number of steps.
     pub total: usize,
-    /// What is worked on.
+    /// The current step.
     pub step: String,
 }
 

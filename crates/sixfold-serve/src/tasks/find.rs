@@ -82,17 +82,17 @@ pub(crate) struct FindForm {
     objects: Vec<String>,
     /// auto, ppf, mttm, views or pix2pose (default: auto; ppf in a program without networks).
     method: Option<String>,
-    /// Most instances of each object (default: 1).
+    /// Maximum number of instances of each object (default: 1).
     instances: Option<u32>,
     /// Poses of a lower confidence are left out (default: the method's, as for `sixfold estimate`).
     min_confidence: Option<f64>,
-    /// x, y, width, height in pixels of the image: the object lies there.
+    /// x, y, width, height in pixels of the image: a box that contains the object.
     #[schema(rename = "box")]
     r#box: Option<String>,
     /// The object lies in this mask: PNG, above zero inside.
     #[schema(value_type = Option<String>, format = Binary)]
     mask: Option<Vec<u8>>,
-    /// Which of a trained model's objects it is, for pix2pose.
+    /// Its id in a trained model, for pix2pose.
     object_id: Option<u32>,
 }
 
@@ -101,12 +101,12 @@ pub(crate) struct FindForm {
     request_body(content = FindForm, content_type = "multipart/form-data"),
     responses(
         (status = 202, description = "The job waits for a worker", body = JobView),
-        (status = 400, description = "No form, or a path in a name", body = Problem),
+        (status = 400, description = "Not a form, or a path in a name", body = Problem),
         (status = 404, description = "An object that is not stored", body = Problem),
-        (status = 413, description = "More bytes than the server takes", body = Problem),
-        (status = 415, description = "Another content type", body = Problem),
-        (status = 422, description = "A field that is not what it should be", body = Problem),
-        (status = 429, description = "Too many jobs wait", body = Problem),
+        (status = 413, description = "The request is larger than the server accepts", body = Problem),
+        (status = 415, description = "Wrong content type", body = Problem),
+        (status = 422, description = "An invalid field", body = Problem),
+        (status = 429, description = "Too many waiting jobs", body = Problem),
     ))]
 pub(crate) async fn find(State(app): Shared, request: HttpRequest) -> Answer<Accepted> {
     let form = Form::read(&app, request, &RULE).await?;
@@ -114,7 +114,7 @@ pub(crate) async fn find(State(app): Shared, request: HttpRequest) -> Answer<Acc
         let images = ImageBytes::of_form(&form)?;
         let request = FindRequest::of_form(app, &form)?;
         request.check(app, &images)?;
-        let job = Request::Find(request).lay_down(app, &images.files())?;
+        let job = Request::Find(request).store_job(app, &images.files())?;
         Ok(Accepted(JobView::of(app, &job)))
     })
     .await
@@ -314,7 +314,9 @@ pub(super) fn run(app: &App, request: &FindRequest, work: &mut Work<'_>) -> Resu
     }
     let overruled = without_overruled(&mut found);
     if overruled > 0 {
-        notes.push(format!("{overruled} poses are left out: most of their pixels belong to surer ones"));
+        notes.push(format!(
+            "{overruled} poses are left out: most of their pixels belong to more confident ones"
+        ));
     }
     work.step(request.objects.len(), request.objects.len(), "drawing")?;
     let searched = SearchedImage {

@@ -75,9 +75,9 @@ pub(crate) struct GraspForm {
     /// Another gripper: a JSON file.
     #[schema(value_type = Option<String>, format = Binary)]
     gripper_file: Option<Vec<u8>>,
-    /// Most grasps (default: 5).
+    /// Maximum number of grasps (default: 5).
     number: Option<u32>,
-    /// Assume nothing of the object's far side (default: false).
+    /// Use only the visible surface, without assumptions about the object's far side (default: false).
     seen_only: Option<bool>,
 }
 
@@ -86,11 +86,11 @@ pub(crate) struct GraspForm {
     request_body(content = GraspForm, content_type = "multipart/form-data"),
     responses(
         (status = 202, description = "The job waits for a worker", body = JobView),
-        (status = 400, description = "No form, or a path in a name", body = Problem),
-        (status = 413, description = "More bytes than the server takes", body = Problem),
-        (status = 415, description = "Another content type", body = Problem),
-        (status = 422, description = "A field that is not what it should be", body = Problem),
-        (status = 429, description = "Too many jobs wait", body = Problem),
+        (status = 400, description = "Not a form, or a path in a name", body = Problem),
+        (status = 413, description = "The request is larger than the server accepts", body = Problem),
+        (status = 415, description = "Wrong content type", body = Problem),
+        (status = 422, description = "An invalid field", body = Problem),
+        (status = 429, description = "Too many waiting jobs", body = Problem),
     ))]
 pub(crate) async fn grasps(State(app): Shared, request: HttpRequest) -> Answer<Accepted> {
     let form = Form::read(&app, request, &RULE).await?;
@@ -100,7 +100,7 @@ pub(crate) async fn grasps(State(app): Shared, request: HttpRequest) -> Answer<A
         let request = GraspRequest::of_form(&form)?;
         request.gripper()?;
         Images::decode(&images, request.depth_scale)?;
-        let job = Request::Grasps(request).lay_down(app, &images.files())?;
+        let job = Request::Grasps(request).store_job(app, &images.files())?;
         Ok(Accepted(JobView::of(app, &job)))
     })
     .await
@@ -191,10 +191,10 @@ pub(super) fn run(request: &GraspRequest, work: &mut Work<'_>) -> Result<Value, 
     work.overlay(&overlay.map_err(|e| ApiError::system("the overlay", e))?)?;
     let mut notes = vec![];
     if view.is_none() {
-        notes.push("nothing stands on the table".to_owned());
+        notes.push("no object found on the table".to_owned());
     }
     if view.as_ref().is_some_and(|v| v.cut_by_edge) {
-        notes.push("the object is cut by the edge of the image: what lies outside was not seen".to_owned());
+        notes.push("the image cuts the object off: the part outside was not seen".to_owned());
     }
     let object_pixels = view.as_ref().map_or(0, |v| v.mask.as_slice().iter().filter(|m| **m).count());
     Ok(json!({

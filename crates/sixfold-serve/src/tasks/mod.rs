@@ -26,7 +26,7 @@ pub(crate) enum Request {
 
 impl Request {
     /// Stores the request as a job with these files.
-    pub fn lay_down(&self, app: &App, files: &[(&str, &[u8])]) -> Answer<Arc<Job>> {
+    pub fn store_job(&self, app: &App, files: &[(&str, &[u8])]) -> Answer<Arc<Job>> {
         let kind = match self {
             Request::Find(_) => JobKind::Find,
             Request::Grasps(_) => JobKind::Grasps,

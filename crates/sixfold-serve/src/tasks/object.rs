@@ -92,7 +92,8 @@ pub(crate) struct ObjectForm {
     resource: Option<Vec<Vec<u8>>>,
     /// The object looks the same however it is rotated about this axis of its own frame: x, y or z.
     turns_about: Option<String>,
-    /// Find the mesh's symmetries and store those that are sure, by `shape` or by shape and `colors`. The job's result lists all.
+    /// Find the mesh's symmetries and store those that are certain, by `shape` or by shape and `colors`. The job's result lists
+    /// all.
     find_symmetries: Option<String>,
     /// Noise of the mesh's surface, standard deviation in millimetres, for find_symmetries (default: 0).
     noise: Option<f64>,
@@ -105,12 +106,12 @@ pub(crate) struct ObjectForm {
     request_body(content = ObjectForm, content_type = "multipart/form-data"),
     responses(
         (status = 202, description = "The job waits for a worker", body = JobView),
-        (status = 400, description = "No form, a bad name, or a path in a name", body = Problem),
+        (status = 400, description = "Not a form, an invalid name, or a path in a name", body = Problem),
         (status = 409, description = "There is an object of this name", body = Problem),
-        (status = 413, description = "More bytes than the server takes", body = Problem),
-        (status = 415, description = "Another content type", body = Problem),
-        (status = 422, description = "A field that is not what it should be", body = Problem),
-        (status = 429, description = "Too many jobs wait", body = Problem),
+        (status = 413, description = "The request is larger than the server accepts", body = Problem),
+        (status = 415, description = "Wrong content type", body = Problem),
+        (status = 422, description = "An invalid field", body = Problem),
+        (status = 429, description = "Too many waiting jobs", body = Problem),
     ))]
 pub(crate) async fn add_object(State(app): Shared, request: HttpRequest) -> Answer<Accepted> {
     let form = Form::read(&app, request, &RULE).await?;
@@ -123,7 +124,7 @@ pub(crate) async fn add_object(State(app): Shared, request: HttpRequest) -> Answ
         let names: Vec<String> = (0..resources.len()).map(|i| format!("resource-{i}")).collect();
         let beside = names.iter().map(String::as_str).zip(resources.iter().map(|r| r.bytes.as_ref()));
         let files: Vec<(&str, &[u8])> = [("mesh", mesh.bytes.as_ref())].into_iter().chain(beside).collect();
-        let job = Request::Object(request).lay_down(app, &files)?;
+        let job = Request::Object(request).store_job(app, &files)?;
         Ok(Accepted(JobView::of(app, &job)))
     })
     .await
@@ -262,7 +263,7 @@ impl Format {
                     "mesh",
                     format!("a file named {name:?}"),
                     "a name that ends in .ply, .obj, .stl, .gltf, .glb or .xyz",
-                    "convert the mesh to one of them; the ending says the format",
+                    "convert the mesh to one of them; the file's extension gives the format",
                 ));
             }
         })

@@ -28,9 +28,9 @@ const REACH: f64 = 10.0;
 #[derive(Debug, Deserialize, ToSchema)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct PoseBody {
-    /// Takes points of the board to the camera's frame, metres, by rows.
+    /// Pose of the board in the camera's frame, 4x4 row by row, metres.
     camera_from_board: Option<[[f64; 4]; 4]>,
-    /// In its place: three points or more with their pixels.
+    /// Instead of a matrix: three or more points with their pixels.
     pairs: Option<Vec<Pair>>,
 }
 
@@ -80,15 +80,16 @@ fn changed(
     Ok(Json(TeachingView::of(app, &entry)?))
 }
 
-/// Corrects a pose: by a matrix, or by points that were marked. Masks and mesh are made again by the next run.
+/// Corrects a pose: by a matrix, or by marked points. The next run computes masks and mesh again.
 #[utoipa::path(put, path = "/v1/teachings/{id}/photographs/{number}/pose", tag = "teachings",
     params(("id" = String, Path, description = "The teaching's id"), ("number" = usize, Path, description = "From 0")),
     request_body(content = PoseBody),
     responses(
         (status = 200, description = "The teaching", body = TeachingView),
         (status = 404, description = "There is no such teaching or photograph", body = Problem),
-        (status = 409, description = "A job works on it, or the camera is not known yet", body = Problem),
-        (status = 422, description = "No pose", body = Problem),
+        (status = 409, description = "A job for it is running or waiting, or the camera has not been found \
+             yet", body = Problem),
+        (status = 422, description = "Not a pose", body = Problem),
     ))]
 pub(crate) async fn set_pose(
     State(app): Shared,
@@ -149,7 +150,7 @@ fn pose_of(body: &PoseBody, teaching: &Teaching, number: usize) -> Answer<Pose> 
     Ok(pose)
 }
 
-/// Corrects a mask: a PNG that is above zero on the object. The mesh is made again by the next run.
+/// Corrects a mask: a PNG that is above zero on the object. The next run computes the mesh again.
 #[utoipa::path(put, path = "/v1/teachings/{id}/photographs/{number}/mask", tag = "teachings",
     params(("id" = String, Path, description = "The teaching's id"), ("number" = usize, Path, description = "From 0")),
     request_body(content = Vec<u8>, content_type = "image/png",
@@ -157,9 +158,9 @@ fn pose_of(body: &PoseBody, teaching: &Teaching, number: usize) -> Answer<Pose> 
     responses(
         (status = 200, description = "The teaching", body = TeachingView),
         (status = 404, description = "There is no such teaching or photograph", body = Problem),
-        (status = 409, description = "A job works on it", body = Problem),
-        (status = 413, description = "More bytes than the server takes", body = Problem),
-        (status = 422, description = "No mask of this photograph", body = Problem),
+        (status = 409, description = "A job for it is running or waiting", body = Problem),
+        (status = 413, description = "The request is larger than the server accepts", body = Problem),
+        (status = 422, description = "Not a mask of this photograph", body = Problem),
     ))]
 pub(crate) async fn set_mask(
     State(app): Shared,
@@ -198,15 +199,16 @@ fn enlarged(mask: &Mask, (width, height): (usize, usize)) -> Option<Mask> {
     good.then(|| Image::from_fn(width, height, |x, y| mask[(x * w / width, y * h / height)]))
 }
 
-/// Leaves a photograph out, or takes it in again. The mesh is made again by the next run.
+/// Leaves a photograph out, or uses it again. The next run computes the mesh again.
 #[utoipa::path(put, path = "/v1/teachings/{id}/photographs/{number}/left_out", tag = "teachings",
     params(("id" = String, Path, description = "The teaching's id"), ("number" = usize, Path, description = "From 0")),
     request_body(content = LeftOutBody),
     responses(
         (status = 200, description = "The teaching", body = TeachingView),
         (status = 404, description = "There is no such teaching or photograph", body = Problem),
-        (status = 409, description = "A job works on it, or the program left it out for a reason", body = Problem),
-        (status = 422, description = "Another body", body = Problem),
+        (status = 409, description = "A job for it is running or waiting, or the program rejected the \
+             photograph", body = Problem),
+        (status = 422, description = "An invalid body", body = Problem),
     ))]
 pub(crate) async fn set_left_out(
     State(app): Shared,
@@ -230,13 +232,13 @@ pub(crate) async fn set_left_out(
     .await
 }
 
-/// Takes back what a person said of a photograph: the program finds pose and mask again.
+/// Removes the corrections of a photograph: the program finds pose and mask again.
 #[utoipa::path(delete, path = "/v1/teachings/{id}/photographs/{number}/corrections", tag = "teachings",
     params(("id" = String, Path, description = "The teaching's id"), ("number" = usize, Path, description = "From 0")),
     responses(
         (status = 200, description = "The teaching", body = TeachingView),
         (status = 404, description = "There is no such teaching or photograph", body = Problem),
-        (status = 409, description = "A job works on it", body = Problem),
+        (status = 409, description = "A job for it is running or waiting", body = Problem),
     ))]
 pub(crate) async fn forget_corrections(
     State(app): Shared,

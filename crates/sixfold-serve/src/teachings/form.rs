@@ -30,7 +30,7 @@ pub(crate) struct TeachingForm {
     /// Photographs of the object on the printed board, PNG or JPEG, from all sides: 8 to 40 in all, more by further requests.
     #[schema(value_type = Vec<String>, format = Binary)]
     photographs: Vec<Vec<u8>>,
-    /// Depth images from the same places (PNG, one channel of 16 bits), in the order of the photographs' names.
+    /// Depth images from the same viewpoints (PNG, one channel of 16 bits), in the order of the photographs' names.
     #[schema(value_type = Option<Vec<String>>, format = Binary)]
     depth: Option<Vec<Vec<u8>>>,
     /// Millimetres per unit of the depth images; needed with them.
@@ -38,13 +38,13 @@ pub(crate) struct TeachingForm {
     /// Camera file of BOP, OpenCV or ROS (default: the camera is found from the photographs).
     #[schema(value_type = Option<String>, format = Binary)]
     camera: Option<Vec<u8>>,
-    /// What the ruler on the printed board measures, millimetres (default: 100).
+    /// Measured length of the ruler on the printed board, millimetres (default: 100).
     ruler: Option<f64>,
-    /// Do not look for hollows by comparing photographs (default: false).
+    /// Do not search for hollows by comparing photographs (default: false).
     hull_only: Option<bool>,
     /// Replace an object of the same name when this one is accepted (default: false).
     replace: Option<bool>,
-    /// Begin at once (default: true); else by `/run`, after more photographs.
+    /// Start at once (default: true); otherwise `/run` starts it, after more photographs.
     start: Option<bool>,
 }
 
@@ -52,7 +52,7 @@ pub(crate) struct TeachingForm {
 #[derive(utoipa::ToSchema)]
 #[allow(dead_code)]
 pub(crate) struct MoreForm {
-    /// More photographs; one of a name that is there replaces that one.
+    /// More photographs; one with the name of an existing photograph replaces it.
     #[schema(value_type = Option<Vec<String>>, format = Binary)]
     photographs: Option<Vec<Vec<u8>>>,
     /// Depth images of these photographs, in the order of their names.
@@ -63,7 +63,7 @@ pub(crate) struct MoreForm {
     /// Camera file for all photographs.
     #[schema(value_type = Option<String>, format = Binary)]
     camera: Option<Vec<u8>>,
-    /// What the ruler on the printed board measures, millimetres.
+    /// Measured length of the ruler on the printed board, millimetres.
     ruler: Option<f64>,
 }
 
@@ -123,7 +123,7 @@ impl<'f> Given<'f> {
         self.photographs.len()
     }
 
-    /// Adds the photographs to a teaching.
+    /// Adds photographs to a teaching.
     pub fn into(self, teaching: &mut Teaching) -> Answer<()> {
         for (photograph, depth) in self.photographs {
             let number = teaching.add_photograph(&photograph.name, &photograph.bytes);

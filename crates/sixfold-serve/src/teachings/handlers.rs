@@ -37,17 +37,17 @@ pub(crate) async fn list_teachings(State(app): Shared) -> Answer<Json<TeachingLi
     .await
 }
 
-/// Begins to teach an object from photographs of it on the printed board, and runs it unless `start` is false.
+/// Starts to teach an object from photographs of it on the printed board, and runs it unless `start` is false.
 #[utoipa::path(post, path = "/v1/teachings", tag = "teachings",
     request_body(content = TeachingForm, content_type = "multipart/form-data"),
     responses(
         (status = 201, description = "The teaching, with its job", body = TeachingView),
-        (status = 400, description = "No form, a bad name, or a path in a name", body = Problem),
+        (status = 400, description = "Not a form, an invalid name, or a path in a name", body = Problem),
         (status = 409, description = "There is an object of this name", body = Problem),
-        (status = 413, description = "More bytes than the server takes", body = Problem),
-        (status = 415, description = "Another content type", body = Problem),
-        (status = 422, description = "A field that is not what it should be", body = Problem),
-        (status = 429, description = "Too many teachings, or too many jobs wait", body = Problem),
+        (status = 413, description = "The request is larger than the server accepts", body = Problem),
+        (status = 415, description = "Wrong content type", body = Problem),
+        (status = 422, description = "An invalid field", body = Problem),
+        (status = 429, description = "Too many teachings, or too many waiting jobs", body = Problem),
     ))]
 pub(crate) async fn add_teaching(
     State(app): Shared,
@@ -105,11 +105,11 @@ pub(crate) async fn get_teaching(State(app): Shared, Path(id): Path<String>) -> 
     app.blocking(move |app| Ok(Json(TeachingView::of(app, app.teachings.get(&id)?.as_ref())?))).await
 }
 
-/// Removes a teaching with its photographs; an object that was made of it stays.
+/// Removes a teaching with its photographs; an object that was stored from it remains.
 #[utoipa::path(delete, path = "/v1/teachings/{id}", tag = "teachings", params(("id" = String, Path, description = "Its id")), responses(
-    (status = 204, description = "It is gone"),
+    (status = 204, description = "Removed"),
     (status = 404, description = "There is no such teaching", body = Problem),
-    (status = 409, description = "A job works on it", body = Problem),
+    (status = 409, description = "A job for it is running or waiting", body = Problem),
 ))]
 pub(crate) async fn delete_teaching(State(app): Shared, Path(id): Path<String>) -> Answer<StatusCode> {
     app.blocking(move |app| app.teachings.remove(app, &id)).await?;
@@ -122,12 +122,12 @@ pub(crate) async fn delete_teaching(State(app): Shared, Path(id): Path<String>) 
     request_body(content = MoreForm, content_type = "multipart/form-data"),
     responses(
         (status = 200, description = "The teaching", body = TeachingView),
-        (status = 400, description = "No form, or a path in a name", body = Problem),
+        (status = 400, description = "Not a form, or a path in a name", body = Problem),
         (status = 404, description = "There is no such teaching", body = Problem),
-        (status = 409, description = "A job works on it", body = Problem),
-        (status = 413, description = "More bytes than the server takes", body = Problem),
-        (status = 415, description = "Another content type", body = Problem),
-        (status = 422, description = "A field that is not what it should be", body = Problem),
+        (status = 409, description = "A job for it is running or waiting", body = Problem),
+        (status = 413, description = "The request is larger than the server accepts", body = Problem),
+        (status = 415, description = "Wrong content type", body = Problem),
+        (status = 422, description = "An invalid field", body = Problem),
     ))]
 pub(crate) async fn add_photographs(
     State(app): Shared,
@@ -148,7 +148,7 @@ pub(crate) async fn add_photographs(
                 "send what is to be added",
             ));
         }
-        let most = sixfold_teach::MOST_PHOTOGRAPHS;
+        let most = sixfold_teach::MAX_PHOTOGRAPHS;
         if known.photographs().len() + given.photographs() > most {
             let found = format!("{} and {} more", known.photographs().len(), given.photographs());
             return Err(ApiError::field(
@@ -168,12 +168,12 @@ pub(crate) async fn add_photographs(
     .await
 }
 
-/// Makes what is missing, after corrections only what depends on them: a job.
+/// Computes what is missing, after corrections only what depends on them: a job.
 #[utoipa::path(post, path = "/v1/teachings/{id}/run", tag = "teachings", params(("id" = String, Path, description = "Its id")), responses(
     (status = 202, description = "The job waits for a worker", body = JobView),
     (status = 404, description = "There is no such teaching", body = Problem),
-    (status = 409, description = "A job works on it already", body = Problem),
-    (status = 429, description = "Too many jobs wait", body = Problem),
+    (status = 409, description = "A job for it is running or waiting", body = Problem),
+    (status = 429, description = "Too many waiting jobs", body = Problem),
 ))]
 pub(crate) async fn run_teaching(State(app): Shared, Path(id): Path<String>) -> Answer<Accepted> {
     app.blocking(move |app| {
@@ -189,7 +189,7 @@ pub(crate) async fn run_teaching(State(app): Shared, Path(id): Path<String>) -> 
 pub(crate) struct AcceptBody {
     /// Another name than the teaching's.
     name: Option<String>,
-    /// Replace an object of this name (default: as the teaching says).
+    /// Replace an object of this name (default: as in the teaching).
     replace: Option<bool>,
 }
 
@@ -199,11 +199,12 @@ pub(crate) struct AcceptBody {
     request_body(content = Option<AcceptBody>),
     responses(
         (status = 202, description = "The job waits for a worker", body = JobView),
-        (status = 400, description = "No name that an object can have", body = Problem),
+        (status = 400, description = "Not a valid object name", body = Problem),
         (status = 404, description = "There is no such teaching", body = Problem),
-        (status = 409, description = "There is no mesh yet, an object of this name, or a job works on it", body = Problem),
-        (status = 422, description = "A body that is not what it should be", body = Problem),
-        (status = 429, description = "Too many jobs wait", body = Problem),
+        (status = 409, description = "There is no mesh yet, the name is taken, or a job for it is running \
+             or waiting", body = Problem),
+        (status = 422, description = "An invalid body", body = Problem),
+        (status = 429, description = "Too many waiting jobs", body = Problem),
     ))]
 pub(crate) async fn accept_teaching(
     State(app): Shared,

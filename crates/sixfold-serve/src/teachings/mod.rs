@@ -128,7 +128,7 @@ impl Entry {
     /// Adds a job for it.
     fn start(&self, app: &App, request: TeachRequest) -> Answer<Arc<Job>> {
         let _held = self.free(app)?;
-        let job = crate::tasks::Request::Teach(request).lay_down(app, &[])?;
+        let job = crate::tasks::Request::Teach(request).store_job(app, &[])?;
         self.note(|record| (record.job, record.problem) = (Some(job.id.clone()), None))?;
         Ok(job)
     }

@@ -23,15 +23,15 @@ const SIDE: usize = 1280;
 const SIDES: std::ops::RangeInclusive<usize> = 64..=2048;
 const QUALITY: u8 = 88;
 
-/// How large an image is sent.
+/// Size of an image.
 #[derive(Debug, Deserialize, IntoParams)]
 #[into_params(parameter_in = Query)]
 pub(crate) struct Detail {
     /// At most this many pixels wide and high, 64 to 2048 (default: 1280).
     side: Option<usize>,
-    /// Of overlays: the object and its surroundings alone, a square.
+    /// For overlays: only the object and its surroundings, a square.
     close_up: Option<bool>,
-    /// The state that is asked for, as links name it: such an image may be kept by the browser.
+    /// The revision that links contain: browsers may cache such an image.
     revision: Option<u64>,
 }
 
@@ -91,13 +91,13 @@ fn jpeg(image: &RgbImage) -> Answer<Vec<u8>> {
     Ok(bytes.into_inner())
 }
 
-/// A photograph without lens distortion; as it is while the camera is not known.
+/// A photograph without lens distortion; with it as long as the camera is not known.
 #[utoipa::path(get, path = "/v1/teachings/{id}/photographs/{number}/image.jpg", tag = "teachings",
     params(("id" = String, Path, description = "The teaching's id"), ("number" = usize, Path, description = "From 0"), Detail),
     responses(
         (status = 200, description = "The image", body = Vec<u8>, content_type = "image/jpeg"),
         (status = 404, description = "There is no such teaching or photograph", body = Problem),
-        (status = 422, description = "No size of an image", body = Problem),
+        (status = 422, description = "Not a valid image size", body = Problem),
     ))]
 pub(crate) async fn photograph_image(
     State(app): Shared,
@@ -116,7 +116,7 @@ pub(crate) async fn photograph_image(
     responses(
         (status = 200, description = "The image", body = Vec<u8>, content_type = "image/jpeg"),
         (status = 404, description = "There is no such teaching or photograph", body = Problem),
-        (status = 422, description = "No size of an image", body = Problem),
+        (status = 422, description = "Not a valid image size", body = Problem),
     ))]
 pub(crate) async fn photograph_overlay(
     State(app): Shared,
@@ -136,7 +136,7 @@ pub(crate) async fn photograph_overlay(
     responses(
         (status = 200, description = "The mask", body = Vec<u8>, content_type = "image/png"),
         (status = 404, description = "There is no such teaching or photograph, or it has no mask", body = Problem),
-        (status = 422, description = "No size of an image", body = Problem),
+        (status = 422, description = "Not a valid image size", body = Problem),
     ))]
 pub(crate) async fn photograph_mask(
     State(app): Shared,
@@ -159,13 +159,13 @@ pub(crate) async fn photograph_mask(
     .await
 }
 
-/// The mesh that was made last: binary PLY in metres with colours, in the object's frame.
+/// The latest mesh: binary PLY in metres with colours, in the object's frame.
 #[utoipa::path(get, path = "/v1/teachings/{id}/mesh.ply", tag = "teachings",
     params(("id" = String, Path, description = "The teaching's id"), MeshDetail),
     responses(
         (status = 200, description = "The mesh", body = Vec<u8>, content_type = "model/ply"),
         (status = 404, description = "There is no such teaching, or no mesh of it yet", body = Problem),
-        (status = 422, description = "Fewer faces than a mesh is reduced to", body = Problem),
+        (status = 422, description = "Fewer faces than the minimum", body = Problem),
     ))]
 pub(crate) async fn teaching_mesh(
     State(app): Shared,

@@ -82,10 +82,10 @@ fn step(
 /// Reports too few photographs before anything is searched in them.
 fn check_number(teaching: &Teaching) -> Result<(), TeachError> {
     let used = || teaching.photographs().iter().filter(|p| !p.left_out_by_person);
-    let least = if used().any(|p| p.depth.is_some()) { FEWEST_WITH_DEPTH } else { FEWEST_PHOTOGRAPHS };
+    let minimum = if used().any(|p| p.depth.is_some()) { FEWEST_WITH_DEPTH } else { FEWEST_PHOTOGRAPHS };
     let found = used().count();
-    if found < least {
-        return Err(TeachError::TooFewPhotographs { found, least, reasons: String::new() });
+    if found < minimum {
+        return Err(TeachError::TooFewPhotographs { found, minimum, reasons: String::new() });
     }
     Ok(())
 }

@@ -19,19 +19,19 @@ pub(crate) struct TeachingView {
     /// The name that the object will have.
     name: String,
     state: TeachingState,
-    /// When it was begun, seconds since 1970.
+    /// When it was created, seconds since 1970.
     created: f64,
-    /// No hollows are looked for by comparing photographs.
+    /// No search for hollows by comparing photographs.
     hull_only: bool,
     /// An object of the same name is replaced.
     replace: bool,
-    /// What the ruler on the printed board measures, millimetres; null: 100.
+    /// Measured length of the ruler on the printed board, millimetres; null: 100.
     ruler: Option<f64>,
-    /// The job that waits or works on it, or did last.
+    /// The waiting or running job, otherwise the last one.
     job: Option<JobView>,
     /// Why the last job failed.
     problem: Option<Problem>,
-    /// The camera with its distortion, once it is given or found; sizes in pixels.
+    /// The camera with its distortion, if given or found; sizes in pixels.
     #[schema(value_type = Option<Object>)]
     camera: Option<sixfold_geometry::Camera>,
     /// Error of the tags' corners, pixels, once poses are found.
@@ -40,18 +40,18 @@ pub(crate) struct TeachingView {
     board: Option<[[f64; 2]; 2]>,
     photographs: Vec<PhotographView>,
     mesh: Option<MeshView>,
-    /// Symmetries of the mesh: the sure ones are stored with the object.
+    /// Symmetries of the mesh: those that are certain are stored with the object.
     symmetries: Vec<SymmetryView>,
-    /// The stored object that was made of it last.
+    /// The object that was last stored from it.
     object: Option<String>,
     links: TeachingLinks,
 }
 
-/// How far a teaching is.
+/// State of a teaching.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum TeachingState {
-    /// Photographs are there; or a correction was made and what depends on it is to be made again.
+    /// It has photographs that were not processed, or corrections whose dependent results must be computed again.
     Ready,
     /// A job waits for a worker.
     Queued,
@@ -78,7 +78,7 @@ pub(crate) struct PhotographView {
     /// Why it is left out.
     reason: Option<String>,
     has_depth: bool,
-    /// Takes points of the board to the camera's frame, metres, by rows.
+    /// Pose of the board in the camera's frame, 4x4 row by row, metres.
     camera_from_board: Option<[[f64; 4]; 4]>,
     /// Who gave the pose: program or person.
     #[schema(value_type = Option<String>)]
@@ -93,17 +93,17 @@ pub(crate) struct PhotographView {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
 pub(crate) enum PhotographState {
-    /// Its pose and mask are known, or will be looked for.
+    /// It is used: its pose and mask are known, or will be searched for.
     Used,
-    /// Nothing was looked for yet.
+    /// It has not been processed yet.
     Waiting,
     /// The program cannot use it.
     LeftOut,
-    /// Somebody said not to use it.
+    /// A person left it out.
     LeftOutByPerson,
 }
 
-/// Where more of a photograph is. Add `&side=N` for images of at most N pixels (default: 1280).
+/// Links of a photograph. Add `&side=N` for images of at most N pixels (default: 1280).
 #[derive(Debug, Serialize, ToSchema)]
 pub(crate) struct PhotographLinks {
     /// Itself without lens distortion.
@@ -114,14 +114,14 @@ pub(crate) struct PhotographLinks {
     mask: Option<String>,
 }
 
-/// What is known of the mesh.
+/// Properties of the mesh.
 #[derive(Debug, Serialize, ToSchema)]
 pub(crate) struct MeshView {
     #[serde(flatten)]
     facts: MeshFacts,
-    /// False where corrections were made since: run the teaching.
+    /// False if it does not include later corrections: run the teaching.
     is_current: bool,
-    /// Takes points of the object's frame to the board's, metres, by rows.
+    /// Pose of the object in the board's frame, 4x4 row by row, metres.
     board_from_object: [[f64; 4]; 4],
     /// Fraction of the surface that no photograph shows.
     unseen: f64,
@@ -154,12 +154,12 @@ impl MeshFacts {
     }
 }
 
-/// Where more of a teaching is.
+/// Links of a teaching.
 #[derive(Debug, Serialize, ToSchema)]
 pub(crate) struct TeachingLinks {
     /// The teaching itself.
     teaching: String,
-    /// POST: makes what is missing, as a job.
+    /// POST: computes what is missing, as a job.
     run: String,
     /// POST: stores the object, as a job.
     accept: String,

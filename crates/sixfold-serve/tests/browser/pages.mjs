@@ -189,7 +189,7 @@ async function poseCorrected(page, address) {
     await page.locator("#editor-status").evaluate((status) => status.replaceChildren());
     await dragged(page, dx, dy);
     await page.locator("#pose-save").click();
-    await page.getByText("The pose is kept.").waitFor();
+    await page.getByText("The pose is saved.").waitFor();
     return apart(await pose(), before);
   };
   const away = await draggedAndSaved(36, -22);
@@ -204,7 +204,7 @@ async function poseCorrected(page, address) {
   await shot(page, "teach-pose");
   await page.locator("#editor-status").evaluate((status) => status.replaceChildren());
   await page.locator("#pose-save").click();
-  await page.getByText("The pose is kept.").waitFor();
+  await page.getByText("The pose is saved.").waitFor();
   const moved = (await teachingOf(page, address)).photographs[3];
   assert.equal(moved.pose_by, "person");
   assert(apart(moved.camera_from_board, before) > 0.01, "dragging, rotating and the wheel change the pose");
@@ -240,7 +240,7 @@ async function pointsMarked(page, address, before) {
   }
   await shot(page, "teach-points");
   await page.locator("#points-save").click();
-  await page.getByText("The pose is kept: look").waitFor();
+  await page.getByText("The pose is saved: check").waitFor();
   const back = (await teachingOf(page, address)).photographs[3].camera_from_board;
   const far = apart(back, before);
   assert(far < 0.02, `marked points give the pose: ${(1000 * far).toFixed(1)} mm`);
@@ -271,7 +271,7 @@ async function maskCorrected(page, address) {
   await page.locator("#mask-mesh").click();
   await shot(page, "teach-mask");
   await page.locator("#mask-save").click();
-  await page.getByText("The mask is kept.").waitFor();
+  await page.getByText("The mask is saved.").waitFor();
   assert.equal((await teachingOf(page, address)).photographs[5].mask_by, "person");
   await page.locator("#editor-close").click();
 }

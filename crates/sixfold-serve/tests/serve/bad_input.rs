@@ -40,7 +40,7 @@ fn camera(form: Form) -> Form {
 }
 
 /// A PNG whose header states a size, with a right checksum, followed by the rest of another file.
-fn lying_png(width: u32, height: u32) -> Vec<u8> {
+fn png_with_wrong_size(width: u32, height: u32) -> Vec<u8> {
     let mut png = depth();
     png[16..20].copy_from_slice(&width.to_be_bytes());
     png[20..24].copy_from_slice(&height.to_be_bytes());
@@ -79,8 +79,16 @@ fn of_images() -> Vec<Case> {
         ),
         find(camera(form().file("depth", "d.png", b"")), "depth", "neither PNG nor JPEG"),
         find(camera(form().file("depth", "d.png", &zip)), "depth", "neither PNG nor JPEG"),
-        find(camera(form().file("depth", "d.png", &lying_png(30_000, 30_000))), "depth", "30000x30000"),
-        find(camera(form().file("depth", "d.png", &lying_png(9_000, 9_000))), "camera", "9000x9000"),
+        find(
+            camera(form().file("depth", "d.png", &png_with_wrong_size(30_000, 30_000))),
+            "depth",
+            "30000x30000",
+        ),
+        find(
+            camera(form().file("depth", "d.png", &png_with_wrong_size(9_000, 9_000))),
+            "camera",
+            "9000x9000",
+        ),
         find(camera(form().file("depth", "d.png", &depth()[..4000])), "depth", "not a readable image"),
         find(camera(form().file("depth", "d.png", &rgb())), "depth", "16 bits"),
         find(camera(form().file("depth", "d.png", &small_depth())), "camera", "640x480"),

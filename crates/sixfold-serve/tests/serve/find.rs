@@ -59,7 +59,7 @@ fn without_a_method_the_first_one_is_taken() {
 }
 
 #[test]
-fn a_box_and_a_mask_say_where_to_look() {
+fn a_box_or_a_mask_limits_the_search() {
     let server = TestServer::new();
     let find = |form: Form| server.result_of("/v1/find", &form).expect(200).json();
     let pose = expected("duck");

@@ -11,7 +11,7 @@ use sixfold_serve::Server;
 
 const FOLDER: &str = "SIXFOLD_SERVE_TEST_FOLDER";
 
-/// Not a test: the server that [`what_was_asked_for_survives_a_kill`] starts as a separate process and kills.
+/// Not a test: the server that [`accepted_requests_survive_a_kill`] starts as a separate process and kills.
 #[test]
 #[ignore = "started by another test"]
 fn serve_until_killed() {
@@ -36,7 +36,7 @@ pub fn to_be_killed(folder: &Path) -> (Child, SocketAddr) {
 }
 
 #[test]
-fn what_was_asked_for_survives_a_kill() {
+fn accepted_requests_survive_a_kill() {
     let folder = tempfile::tempdir().unwrap();
     fill(&folder.path().join("objects"));
     let (mut process, address) = to_be_killed(folder.path());

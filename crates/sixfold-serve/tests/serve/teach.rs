@@ -319,7 +319,7 @@ fn a_teaching_survives_a_kill_and_a_cancelled_one_resumes() {
 }
 
 #[test]
-fn what_teaches_nothing_is_refused_with_what_to_do() {
+fn invalid_teachings_are_refused_with_advice() {
     let truth = photographs();
     let server = TestServer::new();
     let named = |name: &str| Form::default().text("name", name);

@@ -14,7 +14,7 @@ use crate::shipped::DGCM;
 /// Which network encodes objects.
 #[derive(Debug, Args)]
 pub struct NetworkArguments {
-    /// Trained network for experience: a file that `sixfold train dgcm` wrote (default: the one that comes with Sixfold,
+    /// Network that matches experiences: a file that `sixfold train dgcm` wrote (default: the one that comes with Sixfold,
     /// docs/install.md)
     #[arg(long, value_name = "FILE", env = "SIXFOLD_DGCM")]
     pub weights: Option<PathBuf>,

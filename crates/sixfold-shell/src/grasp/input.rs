@@ -82,7 +82,7 @@ pub fn read(a: &InputArguments, rgb: Option<&Path>, seed: u64) -> Result<Input> 
         None => None,
     };
     if view.as_ref().is_some_and(|v| v.cut_by_edge) {
-        eprintln!("note: the object is cut by the edge of the image: what lies outside was not seen");
+        eprintln!("note: the image cuts the object off: the part outside was not seen");
     }
     Ok(Input { depth, camera, rgb, view, began })
 }

@@ -106,7 +106,7 @@ impl TestObject {
         let (member, rest) = self.made.as_ref()?;
         let member_from_camera = (*camera_from_object * rest.rotation()).inverse();
         let part_at = |p: &Vec3| member.part_at(&member_from_camera.transform_point(p));
-        let middle = part_at(&centre_between_pads(&grasp.camera_from_gripper));
+        let central_part = part_at(&centre_between_pads(&grasp.camera_from_gripper));
         let gripper_from_camera = grasp.camera_from_gripper.inverse();
         let held: Vec<&Vec3> = view
             .object
@@ -114,14 +114,14 @@ impl TestObject {
             .iter()
             .filter(|p| gripper.is_between_pads(&gripper_from_camera.transform_point(p), grasp.opening))
             .collect();
-        let same = held.iter().filter(|p| part_at(p) == middle).count();
-        (10 * same >= 7 * held.len()).then_some(middle)
+        let same = held.iter().filter(|p| part_at(p) == central_part).count();
+        (10 * same >= 7 * held.len()).then_some(central_part)
     }
 }
 
 /// Synthetic objects, the same for the same seed.
-pub fn made_up(names: &[String], members: u64, seed: u64) -> Result<Vec<TestObject>> {
-    let mut pupils = vec![];
+pub fn synthetic_objects(names: &[String], members: u64, seed: u64) -> Result<Vec<TestObject>> {
+    let mut test_objects = vec![];
     let families: Vec<Family> = if names.iter().any(|n| n == "all") {
         Family::ALL.to_vec()
     } else {
@@ -142,7 +142,7 @@ pub fn made_up(names: &[String], members: u64, seed: u64) -> Result<Vec<TestObje
             random.set_stream(number * 64 + family as u64);
             let made = member(family, &mut random)?;
             let rest = family.rests()[number as usize % family.rests().len()];
-            pupils.push(TestObject {
+            test_objects.push(TestObject {
                 class: family.name().to_owned(),
                 name: format!("{}-{number}", family.name()),
                 mesh: made.mesh.transformed(&rest.rotation()),
@@ -150,7 +150,7 @@ pub fn made_up(names: &[String], members: u64, seed: u64) -> Result<Vec<TestObje
             });
         }
     }
-    Ok(pupils)
+    Ok(test_objects)
 }
 
 /// One grasp that was tried.
@@ -221,9 +221,9 @@ pub struct Curve {
 }
 
 /// The objects that the arguments name.
-fn pupils(a: &LearnArguments) -> Result<Vec<TestObject>> {
+fn test_objects(a: &LearnArguments) -> Result<Vec<TestObject>> {
     if !a.families.is_empty() {
-        return made_up(&a.families, a.members, a.seed);
+        return synthetic_objects(&a.families, a.members, a.seed);
     }
     let named = named_objects(&a.objects)?.into_iter();
     Ok(named.map(|(class, name, mesh)| TestObject { class, name, mesh, made: None }).collect())
@@ -248,10 +248,10 @@ fn learn_with(a: &LearnArguments, wrap: impl FnOnce(BoxedStore) -> BoxedStore) -
     in_range("--members", a.members, 1..=10_000)?;
     let setting = hardness(&a.physics, a.hard)?;
     let network = model(&a.network)?;
-    let pupils = pupils(a)?;
+    let test_objects = test_objects(a)?;
     let recorded = Recorded {
         experiences: &a.experiences,
-        objects: pupils.iter().map(|p| p.name.as_str()).collect(),
+        objects: test_objects.iter().map(|p| p.name.as_str()).collect(),
         attempts: a.attempts,
         tries: a.tries,
         explore: a.explore,
@@ -274,31 +274,32 @@ fn learn_with(a: &LearnArguments, wrap: impl FnOnce(BoxedStore) -> BoxedStore) -
     let options = LearnerOptions { tries: a.tries, explore: a.explore, near: a.near, part: a.part.clone() };
     let gripper = &setting.gripper;
     let mut learner = Learner { network: &network, memory: &mut memory, gripper, options: &options };
-    let mut progress = Progress::new("scenes", pupils.len() * a.attempts as usize);
-    for pupil in &pupils {
+    let mut progress = Progress::new("scenes", test_objects.len() * a.attempts as usize);
+    for test_object in &test_objects {
         let done =
-            |rows: &[Row], attempt| rows.iter().any(|r| r.object == pupil.name && r.attempt == attempt);
+            |rows: &[Row], attempt| rows.iter().any(|r| r.object == test_object.name && r.attempt == attempt);
         if (0..a.attempts).all(|n| done(&rows, n)) {
-            (0..a.attempts).for_each(|_| progress.step(pupil.name.clone()));
+            (0..a.attempts).for_each(|_| progress.step(test_object.name.clone()));
             continue;
         }
-        let parts = ConvexParts::of_mesh(&pupil.mesh, &PartsOptions::default())
-            .with_context(|| pupil.name.clone())?;
+        let parts = ConvexParts::of_mesh(&test_object.mesh, &PartsOptions::default())
+            .with_context(|| test_object.name.clone())?;
         for attempt in 0..a.attempts {
             if !done(&rows, attempt) {
                 check_interrupt("what was learned is kept; run the same command again to continue")?;
-                let row = self::attempt(a, &setting, &mut learner, pupil, &parts, attempt, &journal.name)?;
+                let row =
+                    self::attempt(a, &setting, &mut learner, test_object, &parts, attempt, &journal.name)?;
                 journal.line(&line(&row))?;
                 rows.push(row);
                 note_left_out(&learner.memory.take_left_out(), &place);
             }
-            progress.step(pupil.name.clone());
+            progress.step(test_object.name.clone());
         }
     }
     progress.finish();
     memory.refresh()?;
     note_left_out(&memory.take_left_out(), &place);
-    Ok(whole(&pupils, &rows, &mut memory, &gripper.name))
+    Ok(whole(&test_objects, &rows, &mut memory, &gripper.name))
 }
 
 type BoxedStore = Box<dyn ExperienceStore + Send>;
@@ -308,7 +309,7 @@ fn line(row: &Row) -> String {
     serde_json::to_string(row).unwrap_or_default()
 }
 
-fn whole(pupils: &[TestObject], rows: &[Row], memory: &mut Memory, gripper: &str) -> Whole {
+fn whole(test_objects: &[TestObject], rows: &[Row], memory: &mut Memory, gripper: &str) -> Whole {
     let held = rows.iter().filter(|r| r.held).count();
     let curve = |p: &TestObject| {
         let mine: Vec<&Row> = rows.iter().filter(|r| r.object == p.name).collect();
@@ -327,7 +328,7 @@ fn whole(pupils: &[TestObject], rows: &[Row], memory: &mut Memory, gripper: &str
         from_experience: rows.iter().filter(|r| r.from_experience).count(),
         experiences: memory.len(),
         outcomes: memory.outcomes(gripper).attempts,
-        objects: pupils.iter().map(curve).collect(),
+        objects: test_objects.iter().map(curve).collect(),
     }
 }
 
@@ -347,15 +348,15 @@ fn attempt(
     a: &LearnArguments,
     setting: &Hardness,
     learner: &mut Learner<'_>,
-    pupil: &TestObject,
+    test_object: &TestObject,
     parts: &ConvexParts,
     attempt: u64,
     journal: &str,
 ) -> Result<Row> {
-    let scene = scene(&pupil.mesh, parts, &setting.options, a.seed, attempt);
+    let scene = scene(&test_object.mesh, parts, &setting.options, a.seed, attempt);
     let empty = Row {
-        object: pupil.name.clone(),
-        class: pupil.class.clone(),
+        object: test_object.name.clone(),
+        class: test_object.class.clone(),
         attempt,
         from_experience: false,
         nearest: None,
@@ -370,13 +371,13 @@ fn attempt(
         return Ok(empty);
     };
     let camera_from_object = seen.world_from_camera.inverse() * scene.world_from_object;
-    let part_of = |grasp: &Grasp| pupil.part(&camera_from_object, grasp, view, &setting.gripper);
+    let part_of = |grasp: &Grasp| test_object.part(&camera_from_object, grasp, view, &setting.gripper);
     let task = GraspTask {
         view,
         planner: AntipodalOptions { seed: scene.noise, ..setting.options.planner },
-        object: &pupil.name,
-        provenance: &format!("simulated, class {}, seed {}, attempt {attempt}", pupil.class, a.seed),
-        part_of: pupil.made.as_ref().map(|_| &part_of as &PartOf<'_>),
+        object: &test_object.name,
+        provenance: &format!("simulated, class {}, seed {}, attempt {attempt}", test_object.class, a.seed),
+        part_of: test_object.made.as_ref().map(|_| &part_of as &PartOf<'_>),
         now,
     };
     let mut try_one = |grasp: &Grasp| {
@@ -422,7 +423,7 @@ mod tests {
 
     #[test]
     fn a_hand_over_the_body_is_not_on_the_handle() {
-        let pupil = made_up(&["drill".to_owned()], 4, 0)
+        let test_object = synthetic_objects(&["drill".to_owned()], 4, 0)
             .unwrap()
             .into_iter()
             .find(|p| {
@@ -431,13 +432,13 @@ mod tests {
                     .is_some_and(|(_, rest)| rest.rotation().rotation_angle_to(&Pose::identity()) < 0.1)
             })
             .expect("a drill that stands");
-        let points = pupil.mesh.sample_surface(4000, 0).points;
-        let (member, _) = pupil.made.as_ref().unwrap();
+        let points = test_object.mesh.sample_surface(4000, 0).points;
+        let (member, _) = test_object.made.as_ref().unwrap();
         let on = |part: &str| -> Vec<Vec3> {
             points.iter().copied().filter(|p| member.part_at(p) == part).collect()
         };
         let handle = on("handle");
-        let middle = handle.iter().sum::<Vec3>() / handle.len() as f64;
+        let centre = handle.iter().sum::<Vec3>() / handle.len() as f64;
         let top = handle.iter().map(|p| p.z).fold(f64::MIN, f64::max);
         // The camera's frame is the object's.
         let view = GraspView {
@@ -455,12 +456,12 @@ mod tests {
         let part = |tips: Vec3, approach: Vec3| {
             let pose = gripper_pose(&tips, &approach, &Vec3::y()).unwrap();
             let grasp = Grasp { camera_from_gripper: pose, opening: 0.08, width: 0.03, quality };
-            pupil.part(&Pose::identity(), &grasp, &view, &gripper)
+            test_object.part(&Pose::identity(), &grasp, &view, &gripper)
         };
         // From behind across the handle, the tips a centimetre past its centre.
-        assert_eq!(part(middle + Vec3::x() * 0.01, Vec3::x()), Some("handle"));
+        assert_eq!(part(centre + Vec3::x() * 0.01, Vec3::x()), Some("handle"));
         // From above, the tips at the upper end of the handle, the body between the fingers.
-        let above = Vec3::new(middle.x, middle.y, top - 0.025);
+        let above = Vec3::new(centre.x, centre.y, top - 0.025);
         assert_eq!(part(above, -Vec3::z()), None);
         // Across the body before the handle.
         let body = on("body");

@@ -160,7 +160,7 @@ pub fn picture(
 pub fn print_table(grasps: &[Proposed]) {
     println!(
         "{:>2} {:>8} {:>8} {:>10} {:>10} {:>26}",
-        "", "quality", "members", "width (m)", "open (m)", "tips' middle (m)"
+        "", "quality", "members", "width (m)", "open (m)", "tips' centre (m)"
     );
     for (i, g) in grasps.iter().enumerate() {
         let t: Vec<String> = g.camera_from_gripper[..3].iter().map(|r| format!("{:8.4}", r[3])).collect();

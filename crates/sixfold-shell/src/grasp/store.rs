@@ -109,7 +109,7 @@ impl LeftOut {
     /// Returns how many there were.
     fn count(self, place: &StorePlace) -> usize {
         if self.damaged > 0 {
-            eprintln!("left out: {} rows of {place} that lie on damaged pages", self.damaged);
+            eprintln!("left out: {} rows of {place} on damaged pages", self.damaged);
         }
         self.rows
     }

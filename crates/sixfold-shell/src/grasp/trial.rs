@@ -17,7 +17,7 @@ pub struct PhysicsArguments {
     /// Gripper: jaws-140, jaws-85, or a file
     #[arg(long, value_name = "NAME_OR_FILE", default_value = "jaws-140")]
     pub gripper: String,
-    /// Mass of the objects, kg (default: 0.2; with --hard, where there is that, 0.5)
+    /// Mass of the objects, kg (default: 0.2; 0.5 where --hard is given)
     #[arg(long, value_name = "KG")]
     pub mass: Option<f64>,
     /// Friction coefficient of the pads (default: the gripper's)
@@ -74,7 +74,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn what_was_asked_for_holds_in_the_hard_setting_too() {
+    fn explicit_options_hold_in_the_hard_setting_too() {
         let of = |mass, friction, hard| {
             let arguments = PhysicsArguments { gripper: "jaws-140".to_owned(), mass, friction, force: None };
             let set = hardness(&arguments, hard).unwrap();

@@ -313,7 +313,7 @@ mod tests {
     }
 
     #[test]
-    fn grey_has_no_hue_and_a_third_of_a_turn_permutes_the_channels() {
+    fn grey_has_no_hue_and_120_degrees_permute_the_channels() {
         let mut patch = Patch::filled(2, 2, [0.4; 3]);
         turn_hue(&mut patch, 1.0, 1.7);
         assert!(patch.data.iter().all(|v| (v - 0.4).abs() < 1e-6));

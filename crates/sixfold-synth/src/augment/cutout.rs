@@ -68,11 +68,11 @@ impl Cutout {
             let low = (centre - reach).floor().clamp(0.0, limit as f32) as usize;
             low..((centre + reach).ceil().clamp(0.0, limit as f32) as usize)
         };
-        let (middle_x, middle_y) = (0.5 * (self.width as f32 - 1.0), 0.5 * (self.height as f32 - 1.0));
+        let (centre_x, centre_y) = (0.5 * (self.width as f32 - 1.0), 0.5 * (self.height as f32 - 1.0));
         for y in span(centre[1], height) {
             for x in span(centre[0], width) {
                 let (dx, dy) = ((x as f32 - centre[0]) * scale, (y as f32 - centre[1]) * scale);
-                let (u, v) = (c * dx + s * dy + middle_x, c * dy - s * dx + middle_y);
+                let (u, v) = (c * dx + s * dy + centre_x, c * dy - s * dx + centre_y);
                 let (color, covered) = self.sample(u, v);
                 if covered <= 0.0 {
                     continue;
@@ -139,7 +139,7 @@ impl Cutout {
         if points.is_empty() {
             return None;
         }
-        let middle = [x_sum / sum, y_sum / sum];
+        let centroid = [x_sum / sum, y_sum / sum];
         let turn = uniform(random, [-std::f32::consts::PI, std::f32::consts::PI]);
         let direction = uniform(random, [0.0, std::f32::consts::TAU]);
         let (dy, dx) = direction.sin_cos();
@@ -163,7 +163,7 @@ impl Cutout {
         let side = uniform(random, [-0.2, 0.2]) * longest;
         let places = (0..12).map(|i| {
             let r = farthest * (1.0 - (i as f32 + random.random::<f32>()) / 12.0);
-            [middle[0] + dx * r - dy * side, middle[1] + dy * r + dx * side]
+            [centroid[0] + dx * r - dy * side, centroid[1] + dy * r + dx * side]
         });
         let centre = places
             .map(|centre| (centre, (hides(centre) - fraction).abs()))
@@ -185,7 +185,7 @@ mod tests {
     }
 
     #[test]
-    fn drawn_without_turn_it_is_what_was_cut() {
+    fn pasted_without_rotation_it_equals_the_cutout() {
         let cutout = square();
         assert_eq!(cutout.size(), (20, 30));
         let (patch, cover) = cutout.draw(60, 60, [19.5, 24.5], 30.0, 0.0);
@@ -196,7 +196,7 @@ mod tests {
     }
 
     #[test]
-    fn it_hides_about_what_it_should() {
+    fn it_hides_about_the_requested_fraction() {
         let visible = Coverage::from_fn(64, 64, |x, y| f32::from(x.abs_diff(32) < 20 && y.abs_diff(30) < 16));
         let mut off = 0.0;
         for number in 0..200 {

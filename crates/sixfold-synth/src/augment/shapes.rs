@@ -149,7 +149,7 @@ mod tests {
     use sixfold_geometry::random::stream;
 
     #[test]
-    fn shapes_hide_what_they_should() {
+    fn shapes_hide_the_requested_fraction() {
         let disc =
             Coverage::from_fn(96, 96, |x, y| f32::from((x as f32 - 48.0).hypot(y as f32 - 40.0) < 30.0));
         for number in 0..300 {

@@ -183,14 +183,14 @@ pub fn member(family: Family, random: &mut impl Rng) -> Result<Member, MeshError
             vessel(&mut b, r, h, between(0.8, 1.0), between(0.003, 0.0045));
             parts.push(("body", b.faces()));
             let (reach, span) = (between(0.018, 0.032), h * between(0.5, 0.75));
-            let (middle, squareness) = (h * between(0.47, 0.58), between(0.5, 1.0));
+            let (half_way, squareness) = (h * between(0.47, 0.58), between(0.5, 1.0));
             // A half superellipse of random fullness, beginning inside the wall.
             let path: Vec<Vec3> = (0..=14)
                 .map(|k| {
                     let angle = PI * (f64::from(k) / 14.0 - 0.5);
                     let full = |v: f64| v.signum() * v.abs().powf(squareness);
                     let x = 0.93 * r + reach * full(angle.cos());
-                    Vec3::new(x, 0.0, middle + 0.5 * span * full(angle.sin()))
+                    Vec3::new(x, 0.0, half_way + 0.5 * span * full(angle.sin()))
                 })
                 .collect();
             let thick = between(0.0035, 0.0055);

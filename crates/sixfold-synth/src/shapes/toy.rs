@@ -54,8 +54,8 @@ fn standing(mesh: &Mesh, diameter: f64) -> Result<Mesh, MeshError> {
         mesh = wider.scaled(diameter / wider.diameter());
     }
     let (low, high) = mesh.bounding_box();
-    let middle = (low + high) * 0.5;
-    Ok(mesh.transformed(&Pose::from_translation(-Vec3::new(middle.x, middle.y, low.z))))
+    let centre = (low + high) * 0.5;
+    Ok(mesh.transformed(&Pose::from_translation(-Vec3::new(centre.x, centre.y, low.z))))
 }
 
 /// Body, head and attached parts, the same on both sides of the plane y = 0.
@@ -63,7 +63,7 @@ fn figure(random: &mut impl Rng) -> Result<Vec<Mesh>, MeshError> {
     let upright = random.random::<f64>() < 0.5;
     let lean = if upright { between(random, -0.2, 0.2) } else { between(random, 0.9, 1.7) };
     let round = match random.random_range(0..3u32) {
-        0 => Kind::Turned,
+        0 => Kind::Lathed,
         1 => Kind::Superquadric,
         _ => Kind::Ellipsoid,
     };
@@ -157,7 +157,7 @@ fn plate(random: &mut impl Rng) -> Result<Vec<Mesh>, MeshError> {
             let size = Vec3::new(between(random, 0.12, 0.3), between(random, 0.12, 0.3), tall);
             parts.push(block(&size, &(pose * Pose::from_translation(Vec3::z() * (0.5 * tall))))?);
         } else {
-            let kind = [Kind::Bar, Kind::Cone, Kind::Turned][random.random_range(0..3usize)];
+            let kind = [Kind::Bar, Kind::Cone, Kind::Lathed][random.random_range(0..3usize)];
             let width = between(random, 0.07, 0.15) / tall;
             parts.push(solid(kind, width, 0.0, random)?.scaled(tall).transformed(&pose));
         }
@@ -186,7 +186,7 @@ fn bracket(random: &mut impl Rng) -> Result<Vec<Mesh>, MeshError> {
     }
     while parts.len() < random.random_range(3..=5usize) {
         let parent = parts[random.random_range(0..parts.len())].clone();
-        let kind = if random.random::<f64>() < 0.5 { Kind::Bar } else { Kind::Turned };
+        let kind = if random.random::<f64>() < 0.5 { Kind::Bar } else { Kind::Lathed };
         let boss = solid(kind, between(random, 0.25, 0.6), 0.0, random)?;
         let axis = Vec3::ith(random.random_range(0..3usize), 1.0);
         parts.push(attach(&parent, &axis, &boss.scaled(between(random, 0.2, 0.4)), false, random));
@@ -201,12 +201,12 @@ fn tool(random: &mut impl Rng) -> Result<Vec<Mesh>, MeshError> {
     let end = grip.vertices().last().copied().unwrap_or_else(Vec3::z);
     let across = between(random, 0.3, 0.8);
     let thick = between(random, 0.15, 0.35);
-    let middle = Pose::from_translation(end);
+    let at_end = Pose::from_translation(end);
     let head = if random.random::<f64>() < 0.5 {
-        block(&Vec3::new(across, thick, between(random, 0.12, 0.35)), &middle)?
+        block(&Vec3::new(across, thick, between(random, 0.12, 0.35)), &at_end)?
     } else {
         let turn = UnitQuaternion::from_axis_angle(&Vector3::y_axis(), FRAC_PI_2);
-        let kind = [Kind::Turned, Kind::Superquadric, Kind::Bar][random.random_range(0..3usize)];
+        let kind = [Kind::Lathed, Kind::Superquadric, Kind::Bar][random.random_range(0..3usize)];
         solid(kind, between(random, 0.15, 0.4), 0.0, random)?
             .scaled(across)
             .transformed(&Pose::from_translation(Vec3::z() * (-0.5 * across)))
@@ -252,12 +252,12 @@ enum Kind {
     Bar,
     Cone,
     Block,
-    Turned,
+    Lathed,
 }
 
 impl Kind {
     const ALL: [Kind; 6] =
-        [Kind::Ellipsoid, Kind::Superquadric, Kind::Bar, Kind::Cone, Kind::Block, Kind::Turned];
+        [Kind::Ellipsoid, Kind::Superquadric, Kind::Bar, Kind::Cone, Kind::Block, Kind::Lathed];
 }
 
 /// A solid of length 1 along z from the origin, `width` its half width, bent by an angle (if it is a bar or a cone).
@@ -285,7 +285,7 @@ fn solid(kind: Kind, width: f64, bend: f64, random: &mut impl Rng) -> Result<Mes
             let size = Vec3::new(2.0 * width, 2.0 * width * flat, 1.0);
             return block(&size, &Pose::from_translation(Vec3::z() * 0.5));
         }
-        Kind::Turned => {
+        Kind::Lathed => {
             let waists = random.random_range(2..=4usize);
             let mut points = vec![(0.0, between(random, 0.4, 1.0))];
             for k in 1..=waists {
@@ -310,14 +310,14 @@ fn block(size: &Vec3, pose: &Pose) -> Result<Mesh, MeshError> {
 /// third of its length; `centred` keeps it in the plane y = 0.
 fn attach(parent: &Mesh, direction: &Vec3, part: &Mesh, centred: bool, random: &mut impl Rng) -> Mesh {
     let (low, high) = parent.bounding_box();
-    let middle = (low + high) * 0.5;
+    let centre = (low + high) * 0.5;
     let direction = direction.try_normalize(1e-9).unwrap_or_else(Vec3::z);
-    let mut best = (f64::NEG_INFINITY, middle, direction);
+    let mut best = (f64::NEG_INFINITY, centre, direction);
     for face in 0..parent.faces().len() {
         let [a, b, c] = parent.triangle(face);
         let Some(normal) = (b - a).cross(&(c - a)).try_normalize(1e-12) else { continue };
         let place = (a + b + c) / 3.0;
-        let along = (place - middle).try_normalize(1e-9).map_or(-1.0, |d| d.dot(&direction));
+        let along = (place - centre).try_normalize(1e-9).map_or(-1.0, |d| d.dot(&direction));
         if along > best.0 {
             best = (along, place, normal);
         }

@@ -15,7 +15,7 @@ use crate::features::{Extractor, FeatureMap};
 use crate::matching::dot;
 use crate::templates::{input_over_grey, render};
 use network::{CELL_INPUTS, OUTPUTS, PICTURE_INPUTS, REACH, RefinerNetwork};
-use samples::middle;
+use samples::cell_centre;
 
 pub mod network;
 pub mod recipe;
@@ -23,7 +23,7 @@ mod samples;
 pub mod training;
 
 /// The pixel that represents a cell.
-const MIDDLE: usize = CELL / 2;
+const HALF_CELL: usize = CELL / 2;
 /// Renders per forward pass.
 const BATCH: usize = 16;
 /// Scales unit features and their products to the magnitude of the other inputs.
@@ -50,7 +50,7 @@ pub fn shown(frame: &mut VisibilityBuffer, mesh: &Mesh, pose: &Pose) -> Option<S
     let mask = rendered.coordinates.as_slice().iter().map(|p| f32::from(!p[0].is_nan())).collect();
     let (mut cells, mut points) = (Vec::new(), Vec::new());
     for cell in 0..n * n {
-        let point = rendered.coordinates[(cell % n * CELL + MIDDLE, cell / n * CELL + MIDDLE)];
+        let point = rendered.coordinates[(cell % n * CELL + HALF_CELL, cell / n * CELL + HALF_CELL)];
         if !point[0].is_nan() {
             cells.push(cell as u16);
             points.push(point);
@@ -239,7 +239,7 @@ fn displaced(shown: &Shown, output: &[f32], cells: usize) -> Displaced {
         let value = |k: usize| f64::from(output[k * area + cell]);
         let flow = Vec2::new(value(0), value(1)) * CELL as f64;
         out.points.push(Vec3::from(point.map(f64::from)));
-        out.pixels.push(middle(cell, cells) + flow);
+        out.pixels.push(cell_centre(cell, cells) + flow);
         out.spreads.push(value(2).clamp(training::SPREADS[0], training::SPREADS[1]).exp() * CELL as f64);
         out.weights.push(sigmoid(value(3)));
         out.score += sigmoid(value(4));
@@ -352,7 +352,7 @@ mod tests {
         let points: Vec<Vec3> = shown.points.iter().map(|p| Vec3::from(p.map(f64::from))).collect();
         for (cell, point) in shown.cells.iter().zip(&points) {
             let seen = camera.project(&near.transform_point(point)).unwrap();
-            assert!((seen - middle(usize::from(*cell), 20)).norm() < 0.1);
+            assert!((seen - cell_centre(usize::from(*cell), 20)).norm() < 0.1);
         }
         let there = points.iter().map(|p| camera.project(&truth.transform_point(p)).unwrap()).collect();
         let count = points.len();

@@ -13,7 +13,7 @@ use sixfold_render::VisibilityBuffer;
 use sixfold_synth::augment::Backgrounds;
 use sixfold_synth::distractors::random_rotation;
 
-use super::{MIDDLE, Shown, shown};
+use super::{HALF_CELL, Shown, shown};
 use crate::network::input;
 use crate::samples::{Framing, Photograph, SEEN, between, distance, object, photograph};
 
@@ -91,7 +91,7 @@ fn target(shown: Shown, photograph: &Photograph, diameter: f32) -> Target {
     let cells = side / CELL;
     let mut out = Target { flow: Vec::new(), visible: Vec::new(), shown };
     for (cell, point) in out.shown.cells.iter().zip(&out.shown.points) {
-        let from = middle(usize::from(*cell), cells);
+        let from = cell_centre(usize::from(*cell), cells);
         let there = photograph.pose.transform_point(&Vec3::from(point.map(f64::from)));
         let pixel = photograph.crop.camera.project(&there);
         let flow = pixel.map_or([0.0; 2], |p| [p.x - from.x, p.y - from.y].map(|v| (v / CELL as f64) as f32));
@@ -112,8 +112,8 @@ fn target(shown: Shown, photograph: &Photograph, diameter: f32) -> Target {
 }
 
 /// The pixel at the centre of a cell.
-pub(crate) fn middle(cell: usize, cells: usize) -> Vec2 {
-    Vec2::new((cell % cells * CELL + MIDDLE) as f64, (cell / cells * CELL + MIDDLE) as f64)
+pub(crate) fn cell_centre(cell: usize, cells: usize) -> Vec2 {
+    Vec2::new((cell % cells * CELL + HALF_CELL) as f64, (cell / cells * CELL + HALF_CELL) as f64)
 }
 
 fn attempt(textures: &Backgrounds, side: usize, random: &mut Random) -> Option<RefinerSample> {

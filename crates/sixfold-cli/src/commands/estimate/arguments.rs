@@ -82,10 +82,10 @@ pub(crate) struct CommonArguments {
     /// Objects to search for: mesh files, or names given with `sixfold object add`
     #[arg(long = "object", value_name = "NAME_OR_MESH", num_args = 1.., conflicts_with = "dataset")]
     pub objects: Vec<String>,
-    /// Unit of mesh files: m, cm, mm, in (meshes in the store know theirs)
+    /// Unit of mesh files: m, cm, mm, in (not needed for stored objects)
     #[arg(long, value_name = "UNIT")]
     pub unit: Option<Unit>,
-    /// Object id of the trained network or detector to search for (default: its only object)
+    /// Object to search for, by its id in the trained network or detector (default: its only object)
     #[arg(long, value_name = "ID", conflicts_with = "dataset")]
     pub object_id: Option<u32>,
     /// Search only in this mask (PNG, above zero inside)
@@ -112,14 +112,14 @@ pub(crate) struct CommonArguments {
     /// Folder of the dataset's models, such as models_cad or models_reconst of T-LESS (default: models, or models_eval without it)
     #[arg(long, value_name = "FOLDER", requires = "dataset", conflicts_with_all = OF_ONE_IMAGE, value_parser = ranges::folder_name)]
     pub models: Option<String>,
-    /// Targets file of the dataset, or all: every annotated pose that is at least 10 % visible (default: its test_targets_bop19.json,
-    /// or all without it)
+    /// Targets file of the dataset, or all: every annotated pose that is at least 10 % visible (default: its
+    /// test_targets_bop19.json, or all without it)
     #[arg(long, value_name = "FILE|all", requires = "dataset", conflicts_with_all = OF_ONE_IMAGE)]
     pub targets: Option<PathBuf>,
     /// Objects of the dataset to search for (default: all targets)
     #[arg(long, value_name = "ID", value_delimiter = ',', requires = "dataset", conflicts_with_all = OF_ONE_IMAGE)]
     pub ids: Vec<u32>,
-    /// Leave out these frames of the dataset, such as those of a training: JSON, [{"scene_id": 2, "im_id": 36}, ...]
+    /// Leave out these frames of the dataset, such as those used for training: JSON, [{"scene_id": 2, "im_id": 36}, ...]
     #[arg(long, value_name = "FILE", requires = "dataset", conflicts_with_all = OF_ONE_IMAGE)]
     pub except: Option<PathBuf>,
     /// Boxes to search in: gt (ground truth), detect (from --detector), or a file of COCO detections (default: detect with

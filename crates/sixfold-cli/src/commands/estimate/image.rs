@@ -119,7 +119,8 @@ pub(super) fn run(a: &EstimateArguments) -> Result<Outcome> {
     let place = region::find(common, &input.lens, input.rgb.as_ref())?;
     let region = match &place {
         Where::Anywhere if needs.region == Need::Required => bail!(
-            "--method {} needs to know where the object is: give --detector FILE.safetensors, --box X,Y,W,H or --mask FILE",
+            "--method {} needs a region that contains the object: give --detector FILE.safetensors, --box \
+             X,Y,W,H or --mask FILE",
             estimator.name()
         ),
         Where::In(region) => Some(region),
@@ -139,7 +140,7 @@ pub(super) fn run(a: &EstimateArguments) -> Result<Outcome> {
     let mut found = search(common, &image, matches!(place, Where::Nowhere))?;
     let overruled = without_overruled(&mut found);
     if overruled > 0 {
-        eprintln!("note: {overruled} poses are left out: most of their pixels belong to surer ones");
+        eprintln!("note: {overruled} poses are left out: most of their pixels belong to more confident ones");
     }
     let searched = SearchedImage {
         camera: &input.camera,

@@ -35,7 +35,8 @@ pub(super) const PIX2POSE: Method = Method::of::<Pix2PoseArguments>(
 /// Poses from colour without training for the object.
 pub(super) const VIEWS: Method = Method::of::<ViewsArguments>(
     "views",
-    "rendered views of a mesh matched with a colour image, in boxes or in those of a detector for any object, no training",
+    "rendered views of a mesh matched with a colour image, in given boxes or those of a class-agnostic \
+     detector, no training",
 );
 
 /// All methods together, with probabilities.
@@ -76,7 +77,7 @@ struct ViewsArguments {
     /// Network to use instead of the built-in one
     #[arg(long, value_name = "FILE.safetensors")]
     weights: Option<PathBuf>,
-    /// Another detector of any object than that within the program, which says where to look if no box is given
+    /// Class-agnostic detector that proposes boxes if none is given, instead of the built-in one
     #[arg(long, value_name = "FILE.safetensors")]
     proposals: Option<PathBuf>,
     /// Leave out the last step, which aligns the rendered mesh with the image
@@ -110,8 +111,8 @@ struct Pix2PoseArguments {
     /// Leave out the last step, which aligns the rendered mesh with the image
     #[arg(long)]
     no_refine: bool,
-    /// Most passes over an object: each but the first is into the box of the pose before, which helps where boxes are poor and
-    /// takes as long again (default: 1)
+    /// Maximum number of passes over an object (default: 1). Each further pass crops the box of the previous pose, which helps with
+    /// inaccurate boxes, and takes as long as the first
     #[arg(long, alias = "looks", value_name = "N", value_parser = count::<100>, conflicts_with = "preset")]
     passes: Option<NonZeroUsize>,
     /// Align poses with the depth image (ICP)

@@ -23,7 +23,7 @@ pub(crate) enum GraspCommand {
     /// Try one grasp in a physics engine: approach, close, lift 10 cm, shake (exit status 0 when it holds)
     #[cfg(feature = "physics")]
     #[command(after_help = "Example:\n  sixfold grasp try --object can.ply --unit mm --tip 0,0,0.06\n\n\
-        The object stands on the table z = 0 with its own z axis up, in the middle of the world's frame.")]
+        The object stands on the table z = 0 with its own z axis up, at the origin of the world frame.")]
     Try(super::try_one::TryArguments),
     /// Measure the planner: objects on a table, simulated depth views, proposals tried (runs sixfold-experiments)
     #[command(disable_help_flag = true)]
@@ -33,8 +33,8 @@ pub(crate) enum GraspCommand {
     #[command(after_help = "Examples:\n  \
         sixfold grasp learn --experiences experience.db --families all --members 6 --attempts 4 --out out/learn\n  \
         sixfold grasp learn --experiences experience.db --object drill.ply --unit mm --attempts 12 --out out/drill\n\n\
-        When the nearest experience is near enough, its grasp is tried, else the geometric planner's. Stopped, the same \
-        command resumes.")]
+        If the nearest experience is near enough, its grasp is tried, otherwise the geometric \
+        planner's. After a stop, the same command resumes.")]
     Learn(Box<sixfold_shell::grasp::learn::LearnArguments>),
     /// Compare geometry, experience and both on the same simulated scenes (runs sixfold-experiments)
     #[command(disable_help_flag = true)]

@@ -127,7 +127,7 @@ pub(crate) struct AddArguments {
     /// The part that was grasped, such as handle
     #[arg(long, value_name = "NAME")]
     pub part: Option<String>,
-    /// Where the experience comes from
+    /// Origin of the experience
     #[arg(long, value_name = "TEXT", default_value = "added by hand")]
     pub provenance: String,
     #[command(flatten)]
@@ -153,7 +153,7 @@ fn add(a: &AddArguments, json: &JsonArguments) -> Result<Outcome> {
     let network = model(&a.network)?;
     let input = input::read(&a.input, None, 0)?;
     let Some(view) = &input.view else {
-        bail!("{}: nothing stands on the table; give --mask", a.input.depth.display());
+        bail!("{}: no object found on the table; give --mask", a.input.depth.display());
     };
     let crop =
         Crop::of_view(view, network.crop_options()).with_context(|| a.input.depth.display().to_string())?;

@@ -108,7 +108,8 @@ pub(super) fn run(a: &TryArguments) -> Result<Outcome> {
     report(&a.json, &whole, || {
         println!("{}: {}", whole.object, result.outcome);
         println!(
-            "gap {:.1} mm, raised {:.1} mm, slid {:.1} mm and turned {:.1} degrees in the hand, pushed {:.1} mm before the lift",
+            "gap {:.1} mm, raised {:.1} mm, slid {:.1} mm and rotated {:.1} degrees in the gripper, pushed \
+             {:.1} mm before the lift",
             1e3 * result.gap,
             1e3 * result.raised,
             1e3 * result.slip,

@@ -92,7 +92,8 @@ pub(crate) struct AddArguments {
     /// Axis of a continuous symmetry, in the object's frame: x, y or z
     #[arg(long, value_name = "AXIS", conflicts_with = "models_info")]
     pub turns_about: Option<Axis>,
-    /// Find the mesh's symmetries (`sixfold object symmetries`) and store those that are sure, by shape and colours or by shape
+    /// Find the mesh's symmetries (`sixfold object symmetries`) and store those that are certain, by shape and colours or by shape
+    /// alone
     #[arg(long, value_enum, value_name = "BY", num_args = 0..=1, default_missing_value = "colors",
         conflicts_with_all = ["turns_about", "depth"])]
     pub find_symmetries: Option<Evidence>,
@@ -115,9 +116,9 @@ pub(crate) enum Axis {
 /// From which sides templates are rendered.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum TemplateViews {
-    /// From above, the camera held upright: 305 views with 7 turns, for what stands on a table, z axis up
+    /// From above, the camera upright: 305 views with 7 rotations each, for objects on a table with their z axis up
     Above,
-    /// From all sides, any rotation of the camera: 642 views with 24 turns
+    /// From all sides, the camera rotated about its axis in any way: 642 views with 24 rotations each
     Around,
 }
 

@@ -124,7 +124,7 @@ fn add_mesh(store: &ObjectStore, a: &AddArguments, mesh: &Path, json: &JsonArgum
             listed.record.faces
         );
         if let Some((views, turns)) = views {
-            println!("{views} views with {turns} turns each");
+            println!("{views} views with {turns} rotations each");
         }
         symmetries.iter().for_each(|line| println!("  {line}"));
     })?;

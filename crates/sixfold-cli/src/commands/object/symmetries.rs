@@ -26,7 +26,7 @@ pub(crate) struct SymmetriesArguments {
     /// Noise of the mesh's surface, standard deviation in millimetres: 1 for a mesh from photographs or depth images
     #[arg(long, value_name = "MM", default_value_t = 0.0, value_parser = ranges::surface_noise)]
     pub noise: f64,
-    /// Image to write: the object beside itself, rotated by each symmetry
+    /// Image to write: the object, and the object rotated by each symmetry, side by side
     #[arg(long, value_name = "FILE.png")]
     pub out: Option<PathBuf>,
 }

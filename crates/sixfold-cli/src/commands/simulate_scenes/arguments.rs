@@ -17,7 +17,7 @@ use sixfold_shell::ranges::{folder_name, in_range, without_duplicates};
 use sixfold_shell::scenes::NamedModels;
 
 /// Maximum number of synthetic objects of a kind: each is kept in memory with its mesh.
-const MOST_OBJECTS: usize = 10_000;
+const MAX_OBJECTS: usize = 10_000;
 
 /// Shown under `sixfold simulate-scenes --help`.
 pub(crate) const AFTER_HELP: &str = "Examples:\n  \
@@ -32,7 +32,7 @@ pub(crate) struct SimulateScenesArguments {
     /// Objects: mesh files, or names given with `sixfold object add`
     #[arg(long = "object", value_name = "NAME_OR_MESH", num_args = 1..)]
     pub objects: Vec<String>,
-    /// Unit of mesh files: m, cm, mm, in (meshes in the store know theirs)
+    /// Unit of mesh files: m, cm, mm, in (not needed for stored objects)
     #[arg(long, value_name = "UNIT")]
     pub unit: Option<Unit>,
     /// Folder of stored objects
@@ -126,8 +126,8 @@ impl SimulateScenesArguments {
         let counts = [
             ("--scenes", self.scenes, 1..=1_000_000),
             ("--views", self.views, 1..=10_000),
-            ("--members", self.members, 1..=MOST_OBJECTS),
-            ("--toys", self.toys, 0..=MOST_OBJECTS),
+            ("--members", self.members, 1..=MAX_OBJECTS),
+            ("--toys", self.toys, 0..=MAX_OBJECTS),
         ];
         for (option, value, range) in counts {
             in_range(option, value, range)?;

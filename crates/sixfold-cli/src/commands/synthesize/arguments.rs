@@ -24,7 +24,7 @@ pub(crate) enum WeightingKind {
 /// Whether objects moved between photographs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum SceneArgument {
-    /// Decided by how well the given poses agree with one arrangement
+    /// Decided by how well the given poses agree with one static arrangement
     Judge,
     /// Only the camera moved
     Still,
@@ -35,7 +35,7 @@ pub(crate) enum SceneArgument {
 /// By what photographs are chosen.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum SelectKind {
-    /// Those that add most of the surface
+    /// Those that add the most surface
     Surface,
     /// At random, no two with poses nearer than 0.3 m and 45 degrees
     Pose,
@@ -136,7 +136,7 @@ pub(crate) struct SynthesizeArguments {
     /// Elevation of the camera over the object's xy plane, lowest and highest, degrees
     #[arg(long, value_name = "LOW,HIGH", value_delimiter = ',', default_values_t = [0.0, 85.0], allow_hyphen_values = true)]
     pub elevation: Vec<f64>,
-    /// Images of each view, each with a rotation of its own in the image plane (up to 45 degrees) (default: 1; with --preset
+    /// Images of each view, each with another in-plane rotation (up to 45 degrees) (default: 1; with --preset
     /// published: 7, every 15 degrees)
     #[arg(long, value_name = "N")]
     pub turns: Option<usize>,

@@ -36,7 +36,7 @@ pub(super) fn read(a: &SynthesizeArguments) -> Result<RoughImages> {
                 None => 1,
                 Some([only]) => only.id,
                 Some(several) => bail!(
-                    "--detector: found {} objects, expected one that knows the object of {} alone",
+                    "--detector: found {} objects, expected a detector of one object, that of {}",
                     several.len(),
                     file.display()
                 ),

@@ -219,7 +219,7 @@ impl Views<'_> {
 }
 
 fn table(a: &SynthesizeArguments, summary: &Summary) {
-    println!("object  photographs  moved     turned    surface unseen  views  pixels unseen");
+    println!("object  photographs  moved     rotated   surface unseen  views  pixels unseen");
     for o in &summary.objects {
         println!(
             "{:6}  {:11}  {:5.1} mm  {:5.2} deg {:13.1} %  {:5}  {:11.1} %",
@@ -234,7 +234,7 @@ fn table(a: &SynthesizeArguments, summary: &Summary) {
     }
     match summary.places {
         _ if summary.still => {
-            println!("the objects stood still in all photographs, so these share their cameras")
+            println!("the objects did not move: each photograph has one camera pose for all of them")
         }
         places if places > summary.objects.len() => {
             println!("between photographs objects were moved: they stood at {places} places");

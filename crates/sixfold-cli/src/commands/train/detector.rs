@@ -23,7 +23,7 @@ fn published() -> DetectorRecipe {
 }
 
 const PHOTOGRAPHS: &str = "Fraction of training images that are parts of photographs, 0 to 1";
-const RENDERS: &str = "Fraction of renders among pasted objects that have photographs, 0 to 1";
+const RENDERS: &str = "Fraction of renders among the pasted objects of which there are photographs, 0 to 1";
 
 #[derive(Debug, Args)]
 pub(crate) struct TrainDetectorArguments {
@@ -32,12 +32,12 @@ pub(crate) struct TrainDetectorArguments {
     /// Folder for checkpoints, learning curves and the finished model
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// Train as published, as far as that is here (docs/published.md): ResNet-50, objects cut out of photographs alone
+    /// Train as published, as far as implemented (docs/published.md): ResNet-50, only objects cut out of photographs
     #[arg(long, value_parser = choices::<Preset>())]
     pub preset: Option<Preset>,
-    #[arg(long, value_parser = choices::<DetectorKind>(), help = presets("Which network learns", default().network.name(), published().network.name()))]
+    #[arg(long, value_parser = choices::<DetectorKind>(), help = presets("Network to train", default().network.name(), published().network.name()))]
     pub network: Option<DetectorKind>,
-    /// What the pyramid of the networks with anchors stands on (default: resnet50, or that of --init)
+    /// Encoder of the networks with anchors (default: resnet50, or that of --init)
     #[arg(long, value_parser = choices::<EncoderKind>())]
     pub backbone: Option<EncoderKind>,
     /// Training steps
@@ -46,10 +46,10 @@ pub(crate) struct TrainDetectorArguments {
     /// Images in a step
     #[arg(long, value_name = "N", default_value_t = default().batch)]
     pub batch: usize,
-    /// Highest learning rate
+    /// Maximum learning rate
     #[arg(long, value_name = "RATE", default_value_t = default().learning_rate)]
     pub learning_rate: f64,
-    /// The pretrained encoder's fraction of the learning rate, 0 to 1
+    /// Learning rate of the pretrained encoder, as a fraction of --learning-rate, 0 to 1
     #[arg(long, value_name = "FRACTION", default_value_t = default().encoder_share)]
     pub encoder_share: f64,
     /// Number of the five stages of the ImageNet encoder that are not trained

@@ -49,13 +49,13 @@ pub(crate) struct TrainDgcmArguments {
     #[arg(
         long,
         value_name = "RATE",
-        help = help("Highest learning rate", |k| k.options().common.learning_rate.to_string())
+        help = help("Maximum learning rate", |k| k.options().common.learning_rate.to_string())
     )]
     pub learning_rate: Option<f64>,
     #[arg(
         long,
         value_name = "WEIGHT",
-        help = help("Weight of the coordinates' loss beside the features'", |k| k.options().lambda.to_string())
+        help = help("Weight of the coordinate loss relative to the feature loss", |k| k.options().lambda.to_string())
     )]
     pub lambda: Option<f64>,
     #[arg(long, value_name = "N", help = presets(VIEWS, default().views, published().views))]

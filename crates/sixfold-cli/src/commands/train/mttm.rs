@@ -44,7 +44,7 @@ pub(crate) struct TrainMttmArguments {
     #[arg(
         long,
         value_name = "RATE",
-        help = help("Highest learning rate", |k| k.options().common.learning_rate.to_string())
+        help = help("Maximum learning rate", |k| k.options().common.learning_rate.to_string())
     )]
     pub learning_rate: Option<f64>,
     /// Synthetic objects: half of them household shapes, half of them toys

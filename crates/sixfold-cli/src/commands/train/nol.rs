@@ -55,7 +55,7 @@ pub(crate) struct TrainNolArguments {
     #[arg(
         long,
         value_name = "RATE",
-        help = help("Highest learning rate", |k| k.options().common.learning_rate.to_string())
+        help = help("Maximum learning rate", |k| k.options().common.learning_rate.to_string())
     )]
     pub learning_rate: Option<f64>,
     /// Seed of weights and samples

@@ -28,8 +28,9 @@ fn defaults() -> (Pix2PoseTrainingOptions, AdversarialOptions) {
 fn steps_help() -> String {
     let (compact, paper) = defaults();
     format!(
-        "Training steps; each takes so many images of every object (default: {}; the dissertation's networks: {}). 0: the \
-         weights of --init as they are, with their alignment's constant error measured again",
+        "Training steps, each with --per-object images of every object (default: {}; the dissertation's \
+         networks: {}). 0: keep \
+         the weights of --init, and only measure the constant error of their alignment again",
         compact.common.steps, paper.steps
     )
 }
@@ -43,12 +44,12 @@ fn per_object_help() -> String {
 fn learning_rate_help() -> String {
     let (compact, paper) = defaults();
     let (compact, paper) = (compact.common.learning_rate, paper.learning_rate);
-    format!("Highest learning rate (default: {compact}; the dissertation's networks: {paper})")
+    format!("Maximum learning rate (default: {compact}; the dissertation's networks: {paper})")
 }
 
 fn network_help() -> String {
     let (ours, published) = (default().network.name(), Pix2PoseRecipe::published().network.name());
-    presets("Which network learns", ours, published)
+    presets("Network to train", ours, published)
 }
 
 fn render_share_help() -> String {

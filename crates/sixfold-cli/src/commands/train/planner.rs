@@ -12,10 +12,10 @@ use sixfold_planners::trials::TrialSetOptions;
 use super::options::ResultArguments;
 use super::{Measured, Shown, Summary, checked, command_line, loss, summary, train_in};
 
-/// Which planner learns.
+/// Planner to train.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub(crate) enum Learned {
-    /// GPD (Ten Pas et al. 2017): a network on images of what the hand closes on
+    /// GPD (Ten Pas et al. 2017): a network on images of the region between the fingers
     Gpd,
     /// HAF (Fischinger et al. 2015): a linear classifier of height accumulated features
     Haf,
@@ -23,25 +23,25 @@ pub(crate) enum Learned {
 
 fn steps_help() -> String {
     let (gpd, haf) = (GpdRecipe::default().options().steps, HafRecipe::PASSES);
-    format!("Training steps; of haf passes over all grasps (default: gpd {gpd}, haf {haf})")
+    format!("Training steps for gpd, passes over all grasps for haf (default: gpd {gpd}, haf {haf})")
 }
 
 #[derive(Debug, Args)]
 pub(crate) struct TrainPlannerArguments {
-    /// Which planner learns
+    /// Planner to train
     #[arg(long, value_name = "NAME", value_enum)]
     pub planner: Learned,
-    /// File of the grasps that are tried; it is made, or completed, and both planners can learn from the same (default:
+    /// File of tried grasps, created or completed by this command; both planners can be trained on the same file (default:
     /// trials.jsonl in --out)
     #[arg(long, value_name = "FILE")]
     pub trials: Option<PathBuf>,
-    /// Scenes in which grasps are tried, four of each object and up to 16 grasps in each; two objects of ten are kept for
-    /// the measurement at the end
+    /// Number of simulated scenes, four of each object, with up to 16 tried grasps each; two of ten objects are held out for the
+    /// measurement at the end
     #[arg(long, value_name = "N", default_value_t = TrialSetOptions::default().scenes)]
     pub scenes: u64,
     #[arg(long, value_name = "N", help = steps_help())]
     pub steps: Option<u64>,
-    #[arg(long, value_name = "RATE", help = format!("Highest learning rate, of gpd alone (default: {})", GpdRecipe::default().options().learning_rate))]
+    #[arg(long, value_name = "RATE", help = format!("Maximum learning rate, gpd only (default: {})", GpdRecipe::default().options().learning_rate))]
     pub learning_rate: Option<f64>,
     /// Seed of objects, scenes, trials and training
     #[arg(long, default_value_t = 0)]

@@ -22,7 +22,7 @@ pub(crate) struct TrainProposalsArguments {
     /// Training steps
     #[arg(long, value_name = "N", default_value_t = default().options.common.steps)]
     pub steps: u64,
-    /// Highest learning rate
+    /// Maximum learning rate
     #[arg(long, value_name = "RATE", default_value_t = default().options.common.learning_rate)]
     pub learning_rate: f64,
     /// Images in a step

@@ -32,7 +32,7 @@ pub(super) const AFTER_HELP: &str = "Examples:\n  \
     sixfold simulate-scenes --families all --members 2 --toys 10 --scenes 24 --views 1 --out sim\n  \
     sixfold reproduce auto --dataset sim --absent 8 --disturb --out out/auto\n  \
     sixfold reproduce auto --dataset sim --absent 8 --disturb --fit calibration.json --out out/auto-fit\n\n\
-    Every image is kept. After a stop, the same command resumes.";
+    Finished images are kept. After a stop, the same command resumes.";
 
 /// `sixfold reproduce auto`.
 #[derive(Debug, Args)]
@@ -58,7 +58,7 @@ pub(crate) struct ReproduceAutoArguments {
     /// Images given to the methods
     #[arg(long, value_enum, num_args = 1.., default_values = ["depth", "both", "color"])]
     pub given: Vec<Given>,
-    /// Change the colours as other lamps and cameras would, for rendered images
+    /// Vary the colours as with other lights and cameras, for rendered images
     #[arg(long)]
     pub disturb: bool,
     /// Run all methods, fit the probabilities to the results, and write them to this file
@@ -73,7 +73,7 @@ pub(crate) struct ReproduceAutoArguments {
     /// Seed of the choice of absent objects and of the disturbance
     #[arg(long, default_value = "0")]
     pub seed: u64,
-    /// Folder for the table, its JSON, pictures, and the images done so far
+    /// Folder for the table, its JSON, figures, and the results of finished images
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
 }
@@ -253,7 +253,7 @@ fn of_dataset(
     let mut progress = Progress::new("images", images.len());
     let mut searches = vec![];
     for (scene_id, im_id) in images {
-        check_interrupt("the images done so far are kept; run the same command again to continue")?;
+        check_interrupt("the results of finished images are kept; run the same command again to continue")?;
         let key = format!("{number}-{scene_id:06}-{im_id:06}");
         let scene = dataset.scene(scene_id)?;
         let image = scene.image(im_id)?;
@@ -325,7 +325,7 @@ fn search<'k>(
     let query = Query { rgb, depth: prepared.as_ref(), ..Query::new(camera) };
     let mut searches = vec![];
     for (id, known) in objects {
-        check_interrupt("the images done so far are kept; run the same command again to continue")?;
+        check_interrupt("the results of finished images are kept; run the same command again to continue")?;
         let truths: Vec<Pose> = image
             .ground_truth
             .iter()

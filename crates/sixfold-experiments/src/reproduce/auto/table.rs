@@ -157,7 +157,7 @@ mod tests {
     }
 
     #[test]
-    fn a_row_counts_what_is_kept_and_what_is_accepted() {
+    fn a_row_counts_kept_and_accepted_poses() {
         let mut searches = vec![
             search(true, 0.95, true),
             search(true, 0.95, true),

@@ -380,7 +380,7 @@ impl Whole {
     fn markdown(&self) -> String {
         let mut out = String::new();
         if self.quick {
-            out += "**Quick: a look, no measurement.**\n\n";
+            out += "**Quick: a check, not a measurement.**\n\n";
         }
         let c = &self.compare;
         let _ = writeln!(

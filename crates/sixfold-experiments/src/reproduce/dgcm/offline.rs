@@ -65,14 +65,14 @@ fn from_above(mesh: &Mesh, gripper: &Gripper) -> Option<(Pose, f64)> {
         Some(points.fold((first, first), |(a, b), p| (a.inf(&p), b.sup(&p))))
     };
     let (a, b) = within(high.z - 0.05 * height)?;
-    let middle = (a + b) * 0.5;
+    let centre = (a + b) * 0.5;
     let (a, b) = within(high.z - depth)?;
     let size = b - a;
     let (closing, width) = if size.x <= size.y { (Vec3::x(), size.x) } else { (Vec3::y(), size.y) };
     if width > gripper.max_opening - ROOM {
         return None;
     }
-    let tip = Vec3::new(middle.x, middle.y, high.z - depth);
+    let tip = Vec3::new(centre.x, centre.y, high.z - depth);
     Some((gripper_pose(&tip, &-Vec3::z(), &closing)?, width))
 }
 

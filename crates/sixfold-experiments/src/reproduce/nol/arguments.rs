@@ -7,7 +7,7 @@ use clap::Args;
 /// Shown under `sixfold reproduce nol --help`.
 pub(crate) const AFTER_HELP: &str = "Example:\n  \
     sixfold reproduce nol --dataset lmo --frames data/lmo-training-frames.json --weights nol.safetensors --hope hope --out out/reproduce-nol\n\n\
-    Every row is kept. After a stop, the same command resumes.";
+    Finished rows are kept. After a stop, the same command resumes.";
 
 #[derive(Debug, Args)]
 pub(crate) struct ReproduceNolArguments {
@@ -26,10 +26,11 @@ pub(crate) struct ReproduceNolArguments {
     /// Another network to render views with, such as one trained without its LSTM; may be given several times
     #[arg(long, value_name = "NAME=FILE.safetensors", value_parser = named_file)]
     pub compare: Vec<(String, PathBuf)>,
-    /// A scene photographed under several lamps by a camera that stood still (HOPE's): two as sources, the third predicted
+    /// A scene photographed by a static camera under several lamps (such as those of HOPE): two images as sources, the third
+    /// predicted
     #[arg(long, value_name = "DIR")]
     pub hope: Option<PathBuf>,
-    /// Folder for the table, its JSON, the images, and the rows done so far
+    /// Folder for the table, its JSON, the images, and the finished rows
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
     /// One disturbance instead of three, and a quarter of the views; the same command without it continues with the others

@@ -49,7 +49,7 @@ pub(super) fn rows(
     let mut rows = vec![];
     for thing in &things {
         for (k, lamp) in lamps.iter().enumerate() {
-            check_interrupt(super::GO_ON)?;
+            check_interrupt(super::RESUME_HINT)?;
             let key = format!("lamp-{lamp}-{}-{}", thing.object, thing.index);
             rows.push(kept_or_made(out, &key, || {
                 let mut others = thing.photographs.clone();

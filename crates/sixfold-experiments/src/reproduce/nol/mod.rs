@@ -32,7 +32,7 @@ use sixfold_shell::output::{JsonArguments, report, write_atomically};
 use sixfold_shell::progress::{Progress, check_interrupt};
 
 /// The message after an interrupt.
-const GO_ON: &str = "the rows done so far are kept; run the same command again to continue";
+const RESUME_HINT: &str = "the finished rows are kept; run the same command again to continue";
 /// Side of the views that are compared, pixels.
 const SIDE: usize = 128;
 /// The inputs of the views, in the order of the table.
@@ -171,7 +171,7 @@ impl Bench<'_> {
             if way == "printed" && model.is_none() {
                 continue;
             }
-            check_interrupt(GO_ON)?;
+            check_interrupt(RESUME_HINT)?;
             let key = format!("{what}-{way}-{seed}");
             rows.push(kept_or_made(&self.a.out, &key, || match way {
                 poses::ANNOTATED => {
@@ -240,18 +240,18 @@ impl Bench<'_> {
             }
         }
         let mut rows = vec![];
-        let mut pictured = false;
+        let mut image_written = false;
         for (key, (frame, photograph)) in keys.iter().zip(&targets) {
-            check_interrupt(GO_ON)?;
+            check_interrupt(RESUME_HINT)?;
             let row = kept_or_made(&self.a.out, key, || {
                 let target = Target { key, frame: *frame, object, photograph, mesh, side: SIDE };
                 let (row, pictures) = views::compare(&target, &ways, &self.judge)?;
-                if !pictured {
+                if !image_written {
                     self.strips.keep(&row, &pictures)?;
                 }
                 Ok(row)
             })?;
-            pictured |= !row.cells.is_empty();
+            image_written |= !row.cells.is_empty();
             rows.push(row);
         }
         Ok(rows)

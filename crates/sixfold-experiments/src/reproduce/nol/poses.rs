@@ -140,7 +140,7 @@ pub(super) fn refine(
             let going =
                 |_, _| !sixfold_shell::progress::interrupted().load(std::sync::atomic::Ordering::SeqCst);
             let refined = refine_scene(&scene, &meshes, &options, &going)?;
-            sixfold_shell::progress::check_interrupt(super::GO_ON)?;
+            sixfold_shell::progress::check_interrupt(super::RESUME_HINT)?;
             let reports = refined.sources;
             (
                 reports.iter().map(|r| r.camera_from_object).collect(),
@@ -246,7 +246,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn errors_are_those_of_the_boxs_middle() {
+    fn errors_are_those_of_the_boxs_centre() {
         let vertices = vec![Vec3::zeros(), Vec3::x() * 0.1, Vec3::y() * 0.1, Vec3::z() * 0.1];
         let mesh = Mesh::new(vertices, vec![[0, 1, 2], [0, 2, 3]]).unwrap();
         let moved = Pose::from_translation(Vec3::new(0.003, 0.004, 0.012));

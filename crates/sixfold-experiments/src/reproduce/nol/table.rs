@@ -9,7 +9,8 @@ use super::views::{MOVED, ViewsSummary};
 pub(super) fn markdown(whole: &Whole) -> String {
     let i = &whole.inputs;
     let mut out = format!(
-        "# Neural Object Learning: {} frames of `{}`\n\nPoses disturbed by up to {:.0} mm along and {} rad about each axis, {} time(s).{}\n",
+        "# Neural Object Learning: {} frames of `{}`\n\nPoses disturbed by up to {:.0} mm along and {} rad \
+         about each axis, {} time(s).{}\n",
         i.frames.len(),
         i.dataset,
         1e3 * super::material::REACH[0],
@@ -17,26 +18,30 @@ pub(super) fn markdown(whole: &Whole) -> String {
         whole.disturbances,
         if whole.quick { " **Quick: one disturbance, a quarter of the views.**" } else { "" }
     );
-    out += "\n## Poses\n\nMedians over photographs of objects: how far the centre of the object's box is from its place, across and along the \
-        optical axis; the angle; the fraction whose box came nearer to its place. The last row says how far annotations and photographs \
-        disagree: no refinement can be nearer to the annotations than the photographs are.\n";
+    out += "\n## Poses\n\nMedians over photographs of objects: error of the centre of the object's box, \
+        across and along the optical axis; the angle; the fraction whose box came nearer to the annotated \
+        one. The last row is the difference between annotations and photographs: no refinement can be \
+        nearer to the annotations than the photographs are.\n";
     poses(&mut out, &whole.poses);
-    out += "\n## Poses of rendered frames\n\nThe same frames, poses and disturbances with exact poses: the coloured models drawn over other \
-        frames' photographs, light and colours changed from frame to frame.\n";
+    out += "\n## Poses of rendered frames\n\nThe same frames, poses and disturbances with exact poses: the \
+        coloured models rendered over other frames' photographs, light and colours changed from frame to \
+        frame.\n";
     poses(&mut out, &whole.drawn_poses);
     views(&mut out, &whole.views, &whole.targets_of_views);
     if !whole.lamps.is_empty() {
-        out += "\n## Another lamp\n\nThe same scene under several lamps by a camera that stood still: each photograph from the others. No method here \
-            knows the lamp, so the numbers in its light count.\n";
+        out += "\n## Another lamp\n\nThe same scene under several lamps, photographed by a static camera: \
+            each photograph is predicted from the others. No method here knows the lamp, so compare the \
+            columns *in its light*.\n";
         measures(&mut out, &whole.lamps);
     }
     let s = &whole.speed;
     let _ = writeln!(
         out,
-        "\n## Time\n\nObject {}, {} photographs, {} threads, {}x{} pixels. Refinement of these photographs alone: {:.1} s. Before the first view: {:.1} s.\n",
+        "\n## Time\n\nObject {}, {} photographs, {} threads, {}x{} pixels. Refinement of these photographs \
+         alone: {:.1} s. Before the first view: {:.1} s.\n",
         s.object, s.sources, s.threads, s.side, s.side, s.refinement, s.preparation
     );
-    out += "| | s a view | photographs behind it |\n|---|---|---|\n";
+    out += "| | seconds per view | photographs used |\n|---|---|---|\n";
     for v in &s.views {
         let _ = writeln!(out, "| {} | {:.2} | {:.1} |", v.method, v.seconds, v.sources);
     }
@@ -84,15 +89,19 @@ fn poses(out: &mut String, rows: &[PosesSummary]) {
 fn views(out: &mut String, rows: &[ViewsSummary], targets: &[usize; 2]) {
     let _ = writeln!(
         out,
-        "\n## Views\n\n{} targets in frames that are no sources, at their true poses, beside the real pixels ({} more were left out: too little of \
-         them is shown by all). Compared where the object is visible and every way shows it. Things in front of the object that the ground truth does not name count against all. PSNR in dB; SSIM; perceptual: mean squared \
-         difference of the first three EfficientNet-Lite0 features, each of length 1 at every place, without learned weights. \
-         *In its light*: after the gain and offset per channel that fit best. *And place*: moved as well, by up to {} pixels along each axis, to where \
-         it fits best, away from the object's border: annotated poses of targets are off by pixels. *Better*: fraction of the targets on which the perceptual distance \
-         is smaller than averaging's from the same photographs. *Unseen*: fraction of the object that no photograph behind the view shows. \
-         *Agreeing*: \
-         what the other photographs do not agree with is taken out of each before (things in front of the object that no mask knows of). \
-         *500 faces* and *vertices 1 mm off*: true poses, the mesh simplified, and with vertices moved by N(0, 1 mm) along each axis.",
+        "\n## Views\n\n{} targets in frames that are no sources, at their ground-truth poses, compared with \
+         the photograph ({} more were left out: too few pixels that all methods show). Compared where the \
+         object is visible and every method shows it. Things in front of the object that the ground truth \
+         does not name count against all. PSNR in dB; SSIM; perceptual: mean squared difference of the \
+         first three EfficientNet-Lite0 features, each normalised to length 1 at every pixel, without \
+         learned weights. *In its light*: after the gain and offset per channel that fit best. *And \
+         place*: also shifted, by up to {} pixels along each axis, to where it fits best, away from the \
+         object's border: annotated poses of targets have errors of pixels. *Better*: fraction of the \
+         targets on which the perceptual distance is smaller than averaging's from the same photographs. \
+         *Unseen*: fraction of the object that no photograph used for the view shows. *Agreeing*: pixels \
+         of a photograph that contradict the other photographs are removed before (things in front of the \
+         object that no mask excludes). *500 faces* and *vertices 1 mm off*: ground-truth poses with a \
+         simplified mesh, and with vertices moved by N(0, 1 mm) along each axis.",
         targets[0], targets[1], MOVED
     );
     measures(out, rows);

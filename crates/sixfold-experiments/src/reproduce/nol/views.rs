@@ -131,16 +131,16 @@ pub(super) fn compare(
     };
     let mut pictures = vec![real.patch.clone()];
     let truth = judge.truth(&real.patch, &common);
-    let middle = without_border(&common, MOVED);
-    let large = middle.as_slice().iter().filter(|m| **m).count() >= MIN_PIXELS;
-    let truth_in_middle = judge.truth(&real.patch, &middle);
+    let inner = without_border(&common, MOVED);
+    let large = inner.as_slice().iter().filter(|m| **m).count() >= MIN_PIXELS;
+    let truth_in_inner = judge.truth(&real.patch, &inner);
     let mut add = |set: &str, method: &str, patch: &Patch, mask: &Mask, unseen: f64| {
         pictures.push(on_grey(patch, mask));
         let lit_patch = in_light_of(patch, &real.patch, &common);
         if let (Some(plain), Some(lit)) = (judge.compare(patch, &truth), judge.compare(&lit_patch, &truth)) {
             let placed = large
-                .then(|| in_place_of(&lit_patch, &real.patch, &middle, MOVED))
-                .and_then(|placed| judge.compare(&placed, &truth_in_middle));
+                .then(|| in_place_of(&lit_patch, &real.patch, &inner, MOVED))
+                .and_then(|placed| judge.compare(&placed, &truth_in_inner));
             row.cells.push(Cell {
                 set: set.to_owned(),
                 method: method.to_owned(),

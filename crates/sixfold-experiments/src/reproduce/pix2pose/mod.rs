@@ -40,8 +40,8 @@ pub(crate) struct ReproducePix2PoseArguments {
     /// Split of the dataset
     #[arg(long, default_value = "test")]
     pub split: String,
-    /// Folder of the dataset's models, such as models_cad or models_reconst of T-LESS (default: models, or models_eval without it; for
-    /// scores the other way about)
+    /// Folder of the dataset's models, such as models_cad or models_reconst of T-LESS (default: models, or models_eval without it;
+    /// for scores the reverse)
     #[arg(long, value_name = "FOLDER", value_parser = folder_name)]
     pub models: Option<String>,
     /// Frames that the model was trained on, which are left out: JSON as for `sixfold train pix2pose`
@@ -50,10 +50,10 @@ pub(crate) struct ReproducePix2PoseArguments {
     /// Trained model
     #[arg(long, value_name = "FILE.safetensors")]
     pub weights: PathBuf,
-    /// Folder for the table, its JSON, and the rows done so far
+    /// Folder for the table, its JSON, and the finished rows
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// Also with the boxes of these files of COCO detections; may be given several times
+    /// Also evaluate with the boxes of this file of COCO detections; may be given several times
     #[arg(long, value_name = "FILE.json")]
     pub detections: Vec<PathBuf>,
     /// Score these published results (BOP's CSV) on the same targets, for comparison
@@ -179,7 +179,7 @@ pub(crate) fn run(a: &ReproducePix2PoseArguments, json: &JsonArguments) -> Resul
     let bench = Bench::new(a, dataset, targets, &pix2pose)?;
     let mut rows = vec![];
     for setting in settings(&bench) {
-        check_interrupt("the rows done so far are kept; run the same command again to continue")?;
+        check_interrupt("the finished rows are kept; run the same command again to continue")?;
         let used = setting.of(&pix2pose, a.seed);
         rows.push(kept_or_made(&a.out, &setting.key, || bench.measure(&used, &setting, &a.out))?);
     }
@@ -301,7 +301,7 @@ fn test_targets(
     let known = |t: &Target| t.object.is_some_and(|o| pix2pose.model().object(o.obj_id).is_ok());
     let others = targets.iter().filter(|t| !known(t)).count();
     if others > 0 {
-        eprintln!("note: {others} targets are of objects that the model does not know; they are left out");
+        eprintln!("note: {others} targets are left out: the model was not trained on their objects");
         targets.retain(known);
     }
     // The model's card states its training frames: scores on them would be meaningless.

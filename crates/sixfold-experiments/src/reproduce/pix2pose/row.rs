@@ -151,7 +151,7 @@ impl Bench {
         let mut scenes = BTreeMap::new();
         let mut progress = Progress::new("images", images.len());
         for ((scene_id, im_id), targets) in &images {
-            check_interrupt("the rows done so far are kept; run the same command again to continue")?;
+            check_interrupt("the finished rows are kept; run the same command again to continue")?;
             if let std::collections::btree_map::Entry::Vacant(place) = scenes.entry(*scene_id) {
                 place.insert(self.dataset.scene(*scene_id)?);
             }
@@ -297,16 +297,16 @@ fn overlap(a: &Rect, b: &Rect) -> f64 {
 
 /// The image with the left, right, upper or lower half of a box black.
 fn half_black(image: &RgbImage, region: &Rect, side: u64) -> RgbImage {
-    let (middle_x, middle_y) = (region.x + 0.5 * region.width, region.y + 0.5 * region.height);
+    let (centre_x, centre_y) = (region.x + 0.5 * region.width, region.y + 0.5 * region.height);
     Image::from_fn(image.width(), image.height(), |x, y| {
         let (u, v) = (x as f64, y as f64);
         let inside =
             u >= region.x && v >= region.y && u < region.x + region.width && v < region.y + region.height;
         let half = match side {
-            0 => u < middle_x,
-            1 => u >= middle_x,
-            2 => v < middle_y,
-            _ => v >= middle_y,
+            0 => u < centre_x,
+            1 => u >= centre_x,
+            2 => v < centre_y,
+            _ => v >= centre_y,
         };
         if inside && half { [0; 3] } else { image[(x, y)] }
     })
@@ -341,7 +341,7 @@ mod tests {
     }
 
     #[test]
-    fn half_of_a_box_turns_black() {
+    fn half_of_a_box_is_painted_black() {
         let image = RgbImage::from_fn(20, 20, |_, _| [200; 3]);
         let region = Rect { x: 4.0, y: 6.0, width: 8.0, height: 10.0 };
         let halves = [(4..8, 6..16), (8..12, 6..16), (4..12, 6..11), (4..12, 11..16)];

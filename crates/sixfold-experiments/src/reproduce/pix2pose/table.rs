@@ -43,7 +43,8 @@ pub(super) fn markdown(whole: &Whole) -> String {
         i.trained_on.len(),
         if i.quick { " **Quick: every eighth frame.**" } else { "" }
     );
-    out += "| what | boxes | targets | AR_MSSD | AR_MSPD | ADD(-S) 10 %, all targets | mean of objects | ms per box, mean / median |\n";
+    out += "| what | boxes | targets | AR_MSSD | AR_MSPD | ADD(-S) 10 %, all targets | mean over objects | \
+         ms per box, mean / median |\n";
     out += "|---|---|---|---|---|---|---|---|\n";
     for row in &whole.rows {
         let s = &row.scores;
