@@ -247,14 +247,15 @@ impl Verifier {
                 }
             }
         }
-        let share = |a: usize, b: usize| if b == 0 { 0.0 } else { a as f64 / b as f64 };
+        let fraction = |a: usize, b: usize| if b == 0 { 0.0 } else { a as f64 / b as f64 };
         if options.occluders_have_edges {
             score.pierced = pierced(&mut self.agreement, width);
         }
-        let outlier_penalty = 1.0 - share(score.outliers, score.rendered);
-        score.depth = outlier_penalty * share(score.inliers, score.rendered + score.pierced - score.occluded);
-        score.boundary = share(on_edge, contour);
-        score.normals = share(good_normals, with_normal);
+        let outlier_penalty = 1.0 - fraction(score.outliers, score.rendered);
+        score.depth =
+            outlier_penalty * fraction(score.inliers, score.rendered + score.pierced - score.occluded);
+        score.boundary = fraction(on_edge, contour);
+        score.normals = fraction(good_normals, with_normal);
         score.total = score.depth * score.boundary * score.normals;
         score
     }

@@ -193,7 +193,7 @@ fn mask_loss(
         let locations = targets.grids[p.level][0] * targets.grids[p.level][1];
         let at = |k: usize| (4 + k) * locations + p.location;
         let mask = &targets.masks[p.instance];
-        let pixels = mask.share.len();
+        let pixels = mask.fractions.len();
         let scale = 1.0 / (masks.max(1) * pixels) as f32;
         let bias = raw.boxes[p.level][at(count)];
         let mut logits = vec![bias; pixels];
@@ -211,9 +211,9 @@ fn mask_loss(
             }
         }
         gradient.clear();
-        for (logit, share) in logits.iter().zip(&mask.share) {
-            value.masks += f64::from(scale * entropy(*logit, *share));
-            gradient.push(weight * scale * (sigmoid(*logit) - share));
+        for (logit, fraction) in logits.iter().zip(&mask.fractions) {
+            value.masks += f64::from(scale * entropy(*logit, *fraction));
+            gradient.push(weight * scale * (sigmoid(*logit) - fraction));
         }
         value.of_boxes[p.level][at(count)] += gradient.iter().sum::<f32>();
         for k in 0..count {

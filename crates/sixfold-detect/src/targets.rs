@@ -51,7 +51,7 @@ pub(crate) struct MaskTarget {
     /// Columns and rows.
     pub size: [usize; 2],
     /// Fraction of each block of pixels that shows the object.
-    pub share: Vec<f32>,
+    pub fractions: Vec<f32>,
 }
 
 /// Targets of one image.
@@ -174,7 +174,7 @@ fn mask_target(annotation: &Annotation, index: usize) -> MaskTarget {
         (first, end)
     };
     let ((x0, x1), (y0, y1)) = (span(left, right, limits[0]), span(top, bottom, limits[1]));
-    let mut share = Vec::with_capacity((x1 - x0) * (y1 - y0));
+    let mut fractions = Vec::with_capacity((x1 - x0) * (y1 - y0));
     for y in y0..y1 {
         for x in x0..x1 {
             let rows = (0..MASK_STRIDE).map(|row| (y * MASK_STRIDE + row) * width + x * MASK_STRIDE);
@@ -184,10 +184,10 @@ fn mask_target(annotation: &Annotation, index: usize) -> MaskTarget {
                     block.iter().filter(|l| usize::from(**l) == index + 1).count()
                 })
                 .sum();
-            share.push(inside as f32 / (MASK_STRIDE * MASK_STRIDE) as f32);
+            fractions.push(inside as f32 / (MASK_STRIDE * MASK_STRIDE) as f32);
         }
     }
-    MaskTarget { corner: [x0, y0], size: [x1 - x0, y1 - y0], share }
+    MaskTarget { corner: [x0, y0], size: [x1 - x0, y1 - y0], fractions }
 }
 
 #[cfg(test)]
@@ -250,9 +250,9 @@ mod tests {
         let targets = Targets::new(&annotation(), &DetectorConfig::compact(3));
         let mask = &targets.masks[1];
         assert_eq!((mask.corner, mask.size), ([13, 3], [19, 21]));
-        let area: f32 = mask.share.iter().sum();
+        let area: f32 = mask.fractions.iter().sum();
         assert_eq!(area * 16.0, 60.0 * 70.0);
         // The first object without the part that the third hides.
-        assert_eq!(targets.masks[0].share.iter().sum::<f32>() * 16.0, 1600.0 - 9.0);
+        assert_eq!(targets.masks[0].fractions.iter().sum::<f32>() * 16.0, 1600.0 - 9.0);
     }
 }

@@ -79,8 +79,8 @@ pub struct IcpOptions {
 impl IcpOptions {
     /// Three levels from `rejection_distance` metres down to a quarter of it.
     pub fn coarse_to_fine(rejection_distance: f64) -> Self {
-        let level = |share: f64, iterations, stride| IcpLevel {
-            rejection_distance: rejection_distance * share,
+        let level = |fraction: f64, iterations, stride| IcpLevel {
+            rejection_distance: rejection_distance * fraction,
             iterations,
             stride,
         };
@@ -241,8 +241,8 @@ pub fn icp(
                     continue;
                 }
                 let residual = n.dot(&(p - q));
-                let share = residual / level.rejection_distance;
-                let weight = (1.0 - share * share).powi(2);
+                let fraction = residual / level.rejection_distance;
+                let weight = (1.0 - fraction * fraction).powi(2);
                 let turn = p.cross(&n);
                 equations.add(&[n.x, n.y, n.z, turn.x, turn.y, turn.z], residual, weight);
                 squares += residual * residual;

@@ -303,10 +303,10 @@ impl<'a> Planner<'a> {
         let length = self.gripper.finger_length;
         let opening = (width + 2.0 * self.options.clearance).min(self.gripper.max_opening);
         // The last one is for flat objects only: higher ones would be held only at their edge.
-        const SHARES: [f64; 5] = [0.9, 0.6, 0.35, 0.2, 0.1];
-        let shares = if self.flat { &SHARES[..] } else { &SHARES[..4] };
-        shares.iter().find_map(|share| {
-            let tip = centre + approach * (share * length);
+        const FRACTIONS: [f64; 5] = [0.9, 0.6, 0.35, 0.2, 0.1];
+        let fractions = if self.flat { &FRACTIONS[..] } else { &FRACTIONS[..4] };
+        fractions.iter().find_map(|fraction| {
+            let tip = centre + approach * (fraction * length);
             let pose = gripper_pose(&tip, approach, closing)?;
             self.grasp(&pose, opening)
         })
@@ -333,8 +333,8 @@ impl<'a> Planner<'a> {
     /// The opening with additional clearance for errors of the assumed points, if the fingers are then free and nothing else is
     /// between them.
     fn widened(&self, pose: &Pose, opening: f64, width: f64) -> f64 {
-        let wider = |share: f64| {
-            (opening + 2.0 * share * self.options.contact_clearance).min(self.gripper.max_opening)
+        let wider = |fraction: f64| {
+            (opening + 2.0 * fraction * self.options.contact_clearance).min(self.gripper.max_opening)
         };
         let fits = |wider: &f64| {
             let extent = self.extent(&self.between(pose, *wider));

@@ -85,7 +85,7 @@ pub fn complete_by_mirrors(view: &GraspView, options: &CompletionOptions) -> Com
         let normal = u * angle.cos() + v * angle.sin();
         let mut along: Vec<f64> = probes.iter().map(|p| normal.dot(p)).collect();
         along.sort_by(f64::total_cmp);
-        let at = |share: f64| along[(share * (along.len() - 1) as f64) as usize];
+        let at = |fraction: f64| along[(fraction * (along.len() - 1) as f64) as usize];
         let centre = 0.5 * (at(0.02) + at(0.98));
         let best = (-options.shifts..=options.shifts)
             .filter_map(|shift| {
@@ -132,10 +132,10 @@ fn judge(view: &GraspView, probes: &[Vec3], plane: &Plane, options: &CompletionO
             Verdict::Unknown => {}
         }
     }
-    let share = |count: f64| count / probes.len() as f64;
+    let fraction = |count: f64| count / probes.len() as f64;
     // Hidden points agree with any plane, so they count less than measured ones.
-    (share(contradicted) <= options.max_contradiction)
-        .then(|| share(supported) + 0.5 * share(hidden) - 2.0 * share(contradicted))
+    (fraction(contradicted) <= options.max_contradiction)
+        .then(|| fraction(supported) + 0.5 * fraction(hidden) - 2.0 * fraction(contradicted))
 }
 
 fn mirror(plane: &Plane, p: &Vec3) -> Vec3 {

@@ -38,12 +38,12 @@ pub enum ViewError {
     Depth(#[from] DepthImageError),
     /// There is no plane that could be a table.
     #[error(
-        "no plane contains {share:.0} % of the measured points, so no table was found: give a mask of the \
+        "no plane contains {percent:.0} % of the measured points, so no table was found: give a mask of the \
          object"
     )]
     NoTable {
         /// Minimum fraction of the points, in per cent.
-        share: f64,
+        percent: f64,
     },
     /// The mask has no pixel.
     #[error("the mask is empty: no pixel is above zero; mark the pixels of the object")]
@@ -288,7 +288,7 @@ pub fn find_objects(
 ) -> Result<Vec<Mask>, ViewError> {
     let depth = checked(depth, camera, options)?;
     let table = table(&depth, camera, options)
-        .ok_or(ViewError::NoTable { share: 100.0 * options.plane.min_share })?;
+        .ok_or(ViewError::NoTable { percent: 100.0 * options.plane.min_share })?;
     // Objects on the table are above a measured part of it; the background behind the table's edge is not.
     let above = above_table(&depth, camera, Some(&table), options.table_margin);
     let on_table = footprint(&depth, camera, &table, options);
@@ -334,8 +334,8 @@ fn footprint(
     }
     let range = |mut values: Vec<f64>| {
         values.sort_by(f64::total_cmp);
-        let at = |share: f64| {
-            values.get((share * values.len().saturating_sub(1) as f64) as usize).copied().unwrap_or(0.0)
+        let at = |fraction: f64| {
+            values.get((fraction * values.len().saturating_sub(1) as f64) as usize).copied().unwrap_or(0.0)
         };
         (at(0.01), at(0.99))
     };

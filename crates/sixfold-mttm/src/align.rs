@@ -34,7 +34,7 @@ pub fn align(scene: &DepthRegion, cloud: &PointCloud, camera_from_view: &Pose, t
     let start = along_the_ray(scene, cloud, camera_from_view, tolerance);
     let target = DepthTarget { depth: scene.depth(), normals: scene.normals(), camera: scene.camera() };
     let level =
-        |(share, iterations)| IcpLevel { rejection_distance: share * tolerance, iterations, stride: 1 };
+        |(fraction, iterations)| IcpLevel { rejection_distance: fraction * tolerance, iterations, stride: 1 };
     let options = IcpOptions {
         levels: LEVELS.map(level).to_vec(),
         max_angle: MAX_ANGLE.to_radians(),

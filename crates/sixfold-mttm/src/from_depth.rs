@@ -129,7 +129,7 @@ fn largest_extent(seen: &[Seen]) -> f64 {
     let width = |d: &Vec3| {
         let mut along: Vec<f64> = seen.iter().map(|s| d.dot(&s.1)).collect();
         along.sort_by(f64::total_cmp);
-        let at = |share: f64| along[(share * (along.len() - 1) as f64) as usize];
+        let at = |fraction: f64| along[(fraction * (along.len() - 1) as f64) as usize];
         at(ENDS.1) - at(ENDS.0)
     };
     directions.iter().map(width).fold(0.0, f64::max)

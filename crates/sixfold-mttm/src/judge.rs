@@ -107,14 +107,14 @@ pub fn judge(
             on_edge += usize::from(scene.edge_distance()[at] <= options.boundary_distance);
         }
     }
-    let share = |a: usize, b: usize| if b == 0 { 0.0 } else { a as f64 / b as f64 };
+    let fraction = |a: usize, b: usize| if b == 0 { 0.0 } else { a as f64 / b as f64 };
     if options.occluders_have_edges && score.occluded > 0 {
         score.pierced = pierced(&mut agreement, SIDE);
     }
-    score.depth = (1.0 - share(score.outliers, score.rendered))
-        * share(score.inliers, score.rendered + score.pierced - score.occluded);
-    score.boundary = share(on_edge, contour);
-    score.normals = share(good_normals, with_normal);
+    score.depth = (1.0 - fraction(score.outliers, score.rendered))
+        * fraction(score.inliers, score.rendered + score.pierced - score.occluded);
+    score.boundary = fraction(on_edge, contour);
+    score.normals = fraction(good_normals, with_normal);
     score.total = score.depth * score.boundary * score.normals;
     score
 }

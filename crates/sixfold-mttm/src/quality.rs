@@ -102,14 +102,14 @@ pub fn quality(network: &Network, pool: &Pool) -> Quality {
         }
     }
     let regions = steps * options.anchors;
-    let share = |n: usize| n as f64 / regions as f64;
+    let fraction = |n: usize| n as f64 / regions as f64;
     Quality {
         regions,
-        nearest: share(nearest),
-        masks: share(masks),
+        nearest: fraction(nearest),
+        masks: fraction(masks),
         rotation: rotation.map(median),
         offset: offset.map(median),
-        matching: 0.5 * share(matching),
+        matching: 0.5 * fraction(matching),
     }
 }
 

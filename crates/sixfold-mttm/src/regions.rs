@@ -53,7 +53,7 @@ impl Regions {
         let seen: Vec<(Roi, Patch)> = sampled
             .par_iter()
             .map(|roi| (*roi, Patch::of_scene(scene, roi, size, side, |_| true)))
-            .filter(|(_, patch)| share_at_centre(patch) >= MIN_CELLS)
+            .filter(|(_, patch)| fraction_at_centre(patch) >= MIN_CELLS)
             .collect();
         let encoded: Vec<Encoded> = seen
             .par_chunks(AT_A_TIME)
@@ -79,7 +79,7 @@ impl Regions {
 }
 
 /// The fraction of a patch's cells whose depth is within a quarter of its size from the centre's.
-fn share_at_centre(patch: &Patch) -> f32 {
+fn fraction_at_centre(patch: &Patch) -> f32 {
     let pixels = patch.side * patch.side;
     let (depth, known) = (&patch.values[3 * pixels..4 * pixels], &patch.values[4 * pixels..]);
     let near = depth.iter().zip(known).filter(|(d, k)| **k > KNOWN && d.abs() < AT_CENTRE).count();
@@ -127,6 +127,6 @@ mod tests {
             patch.values[4 * 784 + i] = 1.0;
             patch.values[3 * 784 + i] = if i < 60 { 0.2 } else { 1.0 };
         }
-        assert!((share_at_centre(&patch) - 60.0 / 784.0).abs() < 1e-6);
+        assert!((fraction_at_centre(&patch) - 60.0 / 784.0).abs() < 1e-6);
     }
 }

@@ -137,14 +137,14 @@ pub fn propose(scene: &DepthRegion, diameter: f64, options: &ProposalOptions) ->
     // The grid is fine enough for far points; for near ones only some of its positions are used.
     let far = (FAR * (depths.len() - 1) as f64) as usize;
     let far = *depths.select_nth_unstable_by(far, f64::total_cmp).1;
-    let mut share = options.step;
+    let mut fraction = options.step;
     loop {
-        let step = (share * diameter * focal / far).max(MIN_STEP);
-        let rois = sample(scene, step, share * diameter * focal, options.layer * diameter);
+        let step = (fraction * diameter * focal / far).max(MIN_STEP);
+        let rois = sample(scene, step, fraction * diameter * focal, options.layer * diameter);
         if rois.len() <= options.most {
             return rois;
         }
-        share *= (rois.len() as f64 / options.most as f64).sqrt().max(GROWTH);
+        fraction *= (rois.len() as f64 / options.most as f64).sqrt().max(GROWTH);
     }
 }
 

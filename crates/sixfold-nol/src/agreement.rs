@@ -122,7 +122,7 @@ mod tests {
         // Left of the centre the pixels are removed, right of it they are kept, and outside the object nothing changes.
         let view = &views[0];
         let column = view.camera.project(&truth[0].translation()).unwrap().x;
-        let share = |wanted: &dyn Fn(usize) -> bool| {
+        let fraction = |wanted: &dyn Fn(usize) -> bool| {
             let pixels: Vec<usize> = (0..side * side).filter(|i| wanted(*i)).collect();
             let kept = pixels.iter().filter(|i| view.visible.data[**i] > 0.5).count();
             kept as f64 / pixels.len() as f64
@@ -130,9 +130,9 @@ mod tests {
         let on = |i: usize| view.depth()[i] > 0.0;
         let left = |i: usize| ((i % side) as f64) < column - 6.0;
         let right = |i: usize| ((i % side) as f64) > column + 6.0;
-        assert!(share(&|i| on(i) && left(i)) < 0.1, "{}", share(&|i| on(i) && left(i)));
-        assert!(share(&|i| on(i) && right(i)) > 0.9, "{}", share(&|i| on(i) && right(i)));
+        assert!(fraction(&|i| on(i) && left(i)) < 0.1, "{}", fraction(&|i| on(i) && left(i)));
+        assert!(fraction(&|i| on(i) && right(i)) > 0.9, "{}", fraction(&|i| on(i) && right(i)));
         let corner = |i: usize| i % side > side - 4 && i / side < 3 && before[0][i] > 0.5;
-        assert!((share(&corner) - 1.0).abs() < 1e-9, "beside the object nothing is taken out");
+        assert!((fraction(&corner) - 1.0).abs() < 1e-9, "beside the object nothing is taken out");
     }
 }

@@ -10,14 +10,14 @@ pub enum NolError {
     Image(#[from] PosedImageError),
     /// The mask is empty, or does not show the object.
     #[error(
-        "photograph {name}: the mask covers {share:.0} % of the object's outline at the given pose, \
+        "photograph {name}: the mask covers {percent:.0} % of the object's outline at the given pose, \
          expected at least {minimum:.0} %; check that the mask belongs to this object and image"
     )]
     Mask {
         /// Name of the photograph.
         name: String,
         /// Part of the outline that the mask covers, per cent.
-        share: f64,
+        percent: f64,
         /// Smallest value accepted, per cent.
         minimum: f64,
     },

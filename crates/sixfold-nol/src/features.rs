@@ -3,7 +3,7 @@
 use sixfold_nn::kernels::neighbours;
 
 use crate::network::{COLOURS, FEATURES};
-use crate::samples::share;
+use crate::samples::relative;
 
 /// Values on a grid, `channels x rows x columns`.
 #[derive(Debug, Clone)]
@@ -34,7 +34,7 @@ impl SourceFeatures {
     /// # Panics
     /// If `out` is shorter than [`Self::channels`].
     pub fn sample(&self, x: f32, y: f32, out: &mut [f32]) {
-        let (x, y) = (share(x, self.side), share(y, self.side));
+        let (x, y) = (relative(x, self.side), relative(y, self.side));
         let mut rest = out;
         for map in &self.maps {
             let (at, weights) = neighbours(x, y, map.size);

@@ -66,8 +66,9 @@ pub(crate) fn image_loss(
         let [_, channels, rows, columns] = map.dims();
         let true_map = true_map.detach();
         let unit = true_map.clone().abs().mean() + 1e-3;
-        let share = (height * width) as f64 / (rows * columns * channels) as f64;
-        features = features + (map - true_map).abs().sum() / (count.clone() * unit) * (share / taps as f64);
+        let fraction = (height * width) as f64 / (rows * columns * channels) as f64;
+        features =
+            features + (map - true_map).abs().sum() / (count.clone() * unit) * (fraction / taps as f64);
     }
     (colours, features)
 }

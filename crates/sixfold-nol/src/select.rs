@@ -37,7 +37,7 @@ pub fn choose_images(object: &mut RoughObject, most: usize) -> Result<Vec<String
         let covered = view.visible_fraction();
         if covered < MIN_MASK {
             let name = image.posed.name().to_owned();
-            let wrong = NolError::Mask { name, share: 100.0 * covered, minimum: 100.0 * MIN_MASK };
+            let wrong = NolError::Mask { name, percent: 100.0 * covered, minimum: 100.0 * MIN_MASK };
             notes.push(format!("{wrong}; left out"));
             shown.push(vec![]);
             continue;

@@ -48,7 +48,7 @@ const BIN_MARGIN: f32 = 0.25;
 /// Maximum number of peaks per reference point; chosen by hand, not swept.
 const PEAKS_PER_REFERENCE: usize = 4;
 /// Minimum votes of a peak, as a fraction of the reference point's best; chosen by hand, not swept.
-const PEAK_SHARE: f32 = 0.7;
+const PEAK_FRACTION: f32 = 0.7;
 /// Neighbouring scene points whose normals differ by more than this angle are not merged when the scene is downsampled, degrees (as
 /// in the model: [`crate::model`]). Chosen by hand; not swept.
 pub(crate) const THINNING_ANGLE: f64 = 30.0;
@@ -64,7 +64,7 @@ impl Default for VotingOptions {
             max_references: MAX_REFERENCES,
             bin_margin: BIN_MARGIN,
             peaks_per_reference: PEAKS_PER_REFERENCE,
-            peak_fraction: PEAK_SHARE,
+            peak_fraction: PEAK_FRACTION,
         }
     }
 }

@@ -249,8 +249,8 @@ static QUANTILES: LazyLock<Vec<f32>> = LazyLock::new(|| {
     let step = 1e-4;
     (0..4096)
         .map(|k| {
-            let share = (f64::from(k) + 0.5) / 4096.0;
-            while below < share {
+            let fraction = (f64::from(k) + 0.5) / 4096.0;
+            while below < fraction {
                 let midpoint = x + 0.5 * step;
                 below += step * (-0.5 * midpoint * midpoint).exp() / std::f64::consts::TAU.sqrt();
                 x += step;

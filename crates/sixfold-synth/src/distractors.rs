@@ -197,14 +197,14 @@ fn lathed(profile: &[(f64, f64)]) -> Mesh {
         let ends = [done / whole, (done + length) / whole];
         done += length;
         for step in 0..=AROUND {
-            let share = f64::from(step) / f64::from(AROUND);
-            let (s, c) = (TAU * share).sin_cos();
+            let fraction = f64::from(step) / f64::from(AROUND);
+            let (s, c) = (TAU * fraction).sin_cos();
             let normal = Vec3::new(up * c, up * s, -along);
             let normal = normal.try_normalize(1e-12).unwrap_or_else(Vec3::zeros);
             for (end, (r, z)) in ends.iter().zip(band) {
                 vertices.push(Vec3::new(r * c, r * s, *z));
                 normals.push(normal);
-                texcoords.push([share as f32, *end as f32]);
+                texcoords.push([fraction as f32, *end as f32]);
             }
         }
         for step in 0..AROUND {
@@ -223,8 +223,8 @@ fn handle(radius: f64, random: &mut Random) -> Mesh {
     let thick = between(random, 0.03, 0.06);
     let (mut vertices, mut normals, mut texcoords, mut faces) = (vec![], vec![], vec![], vec![]);
     for bend in 0..=BENDS {
-        let share = f64::from(bend) / f64::from(BENDS);
-        let (s, c) = (PI * (share - 0.5)).sin_cos();
+        let fraction = f64::from(bend) / f64::from(BENDS);
+        let (s, c) = (PI * (fraction - 0.5)).sin_cos();
         let centre = Vec3::new(radius * 0.95 + reach * c, 0.0, 0.5 + tall * s);
         let outward = Vec3::new(c, 0.0, s);
         for side in 0..=SIDES {
@@ -233,7 +233,7 @@ fn handle(radius: f64, random: &mut Random) -> Mesh {
             let normal = outward * c + Vec3::y() * s;
             vertices.push(centre + normal * thick);
             normals.push(normal);
-            texcoords.push([share as f32, turn as f32]);
+            texcoords.push([fraction as f32, turn as f32]);
         }
     }
     for bend in 0..BENDS {

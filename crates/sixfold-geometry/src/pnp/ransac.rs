@@ -104,9 +104,9 @@ pub(super) fn search<K: Kernel>(data: &Prepared, options: &PnpOptions) -> Option
             };
             if best.is_none_or(|b| cost < b.0) {
                 best = Some((cost, pose));
-                let share = inliers as f64 / n as f64;
-                test.good = share.clamp(0.05, 0.95);
-                needed = samples_needed(share, size, options.confidence, options.max_iterations);
+                let fraction = inliers as f64 / n as f64;
+                test.good = fraction.clamp(0.05, 0.95);
+                needed = samples_needed(fraction, size, options.confidence, options.max_iterations);
             }
         }
     }
@@ -114,8 +114,8 @@ pub(super) fn search<K: Kernel>(data: &Prepared, options: &PnpOptions) -> Option
 }
 
 /// Samples after which one without outliers was drawn with probability `confidence` (Fischler and Bolles 1981).
-fn samples_needed(share: f64, size: usize, confidence: f64, most: usize) -> usize {
-    let clean = share.powi(size as i32);
+fn samples_needed(fraction: f64, size: usize, confidence: f64, most: usize) -> usize {
+    let clean = fraction.powi(size as i32);
     let needed = (1.0 - confidence).ln() / (1.0 - clean).ln();
     if needed.is_finite() {
         (needed.ceil() as usize).clamp(1, most)

@@ -125,7 +125,7 @@ pub(super) fn refine_by_mixture(data: &Prepared, initial: &Pose, window_px: f64,
     let window = window_px * window_px;
     let mut pose = *initial;
     // Initial values: a standard deviation of a quarter of the window, and half of its points outliers.
-    let (mut variance, mut share) = (window / 16.0, 0.5);
+    let (mut variance, mut fraction) = (window / 16.0, 0.5);
     let mut squares = Vec::with_capacity(data.points.len());
     for _ in 0..iterations {
         squares.clear();
@@ -133,14 +133,14 @@ pub(super) fn refine_by_mixture(data: &Prepared, initial: &Pose, window_px: f64,
             squares.push(square);
             0.0
         });
-        let probability = |square: f64, variance: f64, share: f64| {
-            let inlier = share / (2.0 * variance) * (-0.5 * square / variance).exp();
-            inlier / (inlier + (1.0 - share) / window)
+        let probability = |square: f64, variance: f64, fraction: f64| {
+            let inlier = fraction / (2.0 * variance) * (-0.5 * square / variance).exp();
+            inlier / (inlier + (1.0 - fraction) / window)
         };
         for _ in 0..3 {
             let (mut weights, mut sum) = (0.0, 0.0);
             for &square in &squares {
-                let w = probability(square, variance, share);
+                let w = probability(square, variance, fraction);
                 weights += w;
                 sum += w * square;
             }
@@ -148,9 +148,9 @@ pub(super) fn refine_by_mixture(data: &Prepared, initial: &Pose, window_px: f64,
                 return *initial;
             }
             variance = (0.5 * sum / weights).max(1e-12 * window);
-            share = (weights / squares.len() as f64).clamp(0.01, 0.999);
+            fraction = (weights / squares.len() as f64).clamp(0.01, 0.999);
         }
-        let equations = linearise(data, &pose, window, |_, square| probability(square, variance, share));
+        let equations = linearise(data, &pose, window, |_, square| probability(square, variance, fraction));
         let Some(step) = equations.solve(1e-9) else { return *initial };
         pose = pose * Pose::exp(&step);
         if step.amax() < 1e-7 {

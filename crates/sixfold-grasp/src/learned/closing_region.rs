@@ -111,8 +111,8 @@ impl Extent {
 
     /// The centre of a voxel, in the gripper's frame.
     fn voxel(&self, index: [usize; 3]) -> Vec3 {
-        let share = Vec3::from_fn(|k, _| (index[k] as f64 + 0.5) / VOXELS as f64);
-        self.low + self.size.component_mul(&share)
+        let fraction = Vec3::from_fn(|k, _| (index[k] as f64 + 0.5) / VOXELS as f64);
+        self.low + self.size.component_mul(&fraction)
     }
 }
 

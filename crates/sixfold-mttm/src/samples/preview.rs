@@ -32,8 +32,8 @@ pub(crate) fn preview(batch: &Batch, side: usize, rows: usize) -> RgbImage {
                     let color = match column {
                         0 => normal(&batch.regions),
                         1 => {
-                            let share = batch.region_masks[row * MAP * MAP + v / step * MAP + u / step];
-                            normal(&batch.regions).map(|c| (f32::from(c) * (0.25 + 0.75 * share)) as u8)
+                            let fraction = batch.region_masks[row * MAP * MAP + v / step * MAP + u / step];
+                            normal(&batch.regions).map(|c| (f32::from(c) * (0.25 + 0.75 * fraction)) as u8)
                         }
                         2 => normal(&batch.positives),
                         _ => normal(&batch.negatives),

@@ -56,7 +56,7 @@ pub(crate) fn order(lookup: &[Lookup]) -> Vec<usize> {
 }
 
 /// A pixel of a crop as a fraction of its side, as in [`SampledPixel`].
-pub(crate) fn share(pixel: f32, side: usize) -> f32 {
+pub(crate) fn relative(pixel: f32, side: usize) -> f32 {
     (pixel + 0.5) / side as f32
 }
 
@@ -64,7 +64,7 @@ pub(crate) fn share(pixel: f32, side: usize) -> f32 {
 fn colour(patch: &Patch, [x, y]: [f32; 2]) -> [f32; COLOURS] {
     let pixels = patch.width * patch.height;
     let (at, weights) =
-        neighbours(share(x, patch.width), share(y, patch.height), [patch.height, patch.width]);
+        neighbours(relative(x, patch.width), relative(y, patch.height), [patch.height, patch.width]);
     std::array::from_fn(|c| {
         let sum: f32 = at.iter().zip(&weights).map(|(i, w)| patch.data[c * pixels + i] * w).sum();
         2.0 * sum - 1.0
@@ -187,8 +187,8 @@ impl Batch {
                     let at = sample.surface.pixels[*point as usize];
                     places.push(SampledPixel {
                         pixel: at,
-                        x: share(pixel[0], side),
-                        y: share(pixel[1], side),
+                        x: relative(pixel[0], side),
+                        y: relative(pixel[1], side),
                     });
                     let at = at as usize;
                     for (c, value) in colour(&source.patch, *pixel).into_iter().enumerate() {

@@ -10,6 +10,6 @@ mod view;
 
 pub(crate) use batch::look_up;
 pub use batch::{Batch, Lookup, ViewBatchOptions};
-pub(crate) use batch::{order, share};
+pub(crate) use batch::{order, relative};
 pub use object::PaintedObject;
 pub use view::{Sample, ViewSampleOptions, make_sample};

@@ -132,8 +132,8 @@ impl Backgrounds {
     }
 
     /// Sets the fraction of procedural textures among the photographs, 0..1.
-    pub fn with_procedural_fraction(mut self, share: f32) -> Self {
-        self.procedural_fraction = if self.sources.is_empty() { 1.0 } else { share.clamp(0.0, 1.0) };
+    pub fn with_procedural_fraction(mut self, fraction: f32) -> Self {
+        self.procedural_fraction = if self.sources.is_empty() { 1.0 } else { fraction.clamp(0.0, 1.0) };
         self
     }
 
@@ -172,11 +172,11 @@ impl Source {
             };
             let forbidden: f64 =
                 self.keep_out.iter().filter_map(|r| r.intersect(&window)).map(|r| r.area()).sum();
-            let share = forbidden / window.area().max(1.0);
-            if share < best.0 {
-                best = (share, [scale, x, y]);
+            let fraction = forbidden / window.area().max(1.0);
+            if fraction < best.0 {
+                best = (fraction, [scale, x, y]);
             }
-            if share == 0.0 {
+            if fraction == 0.0 {
                 break;
             }
         }

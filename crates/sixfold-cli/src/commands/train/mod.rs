@@ -90,7 +90,7 @@ pub(crate) enum TrainCommand {
                       Writes model.safetensors with its card. The built-in refiner was trained with this command."
     )]
     Refiner(Box<TrainRefinerArguments>),
-    /// Train the detector of any object in colour images, on procedural objects
+    /// Train the class-agnostic detector of objects in colour images, on procedural objects
     #[command(
         after_help = "Example:\n  sixfold train proposals --backgrounds photographs --out out/proposals\n\n\
                       After a stop, the same command resumes."
