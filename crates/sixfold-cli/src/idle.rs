@@ -26,11 +26,7 @@ pub(crate) const IDLE: &[Idle] = &[
     Idle { command: "train pix2pose", options: &["unit", "store"], when: &[Without("objects")] },
     Idle { command: "train pix2pose", options: &["no_adversarial"], when: &[Is("network", &["compact"])] },
     // Without a preset, the network is the compact one.
-    Idle {
-        command: "train pix2pose",
-        options: &["no_adversarial"],
-        when: &[Without("network"), Without("preset")],
-    },
+    Idle { command: "train pix2pose", options: &["no_adversarial"], when: &[Without("network"), Without("preset")] },
     Idle { command: "train detector", options: &["split"], when: &[Without("dataset")] },
     Idle { command: "train detector", options: &["unit", "store"], when: &[Without("objects")] },
     Idle { command: "grasp propose", options: &["weights"], when: &[Without("experiences")] },
@@ -48,8 +44,6 @@ mod tests {
 
     #[test]
     fn the_table_names_options_that_there_are() {
-        let root = Arguments::command();
-        let unknown: Vec<String> = IDLE.iter().filter_map(|idle| idle.unknown(&root)).collect();
-        assert!(unknown.is_empty(), "{unknown:?}");
+        assert_eq!(IDLE.iter().find_map(|idle| idle.unknown(&Arguments::command())), None);
     }
 }

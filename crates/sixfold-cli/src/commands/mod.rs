@@ -33,6 +33,5 @@ pub(crate) use self::{
     without_networks as teach, without_networks as train,
 };
 
-/// Whether commands that need a network are built in. Otherwise they print a message, and help does not list
-/// them.
+/// Whether commands that need a network are built in. Otherwise they print a message, and help does not list them.
 pub(crate) const NETWORKS: bool = cfg!(feature = "networks");

@@ -20,8 +20,7 @@ pub(super) enum Where {
     Nowhere,
 }
 
-/// The region from the options. `lens` is the camera with its distortion, `image` the colour image without
-/// it.
+/// The region from the options. `lens` is the camera with its distortion, `image` the colour image without it.
 pub(super) fn find(a: &CommonArguments, lens: &Camera, image: Option<&RgbImage>) -> Result<Where> {
     let boxed = given_box(a, lens)?.map(|b| undistort_box(&b, lens));
     if let Some(weights) = &a.detector {

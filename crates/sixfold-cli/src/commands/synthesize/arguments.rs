@@ -105,8 +105,7 @@ pub(crate) struct SynthesizeArguments {
     /// Minimum visible fraction of the object; other photographs are left out
     #[arg(long, value_name = "FRACTION", default_value = "0.5")]
     pub least_visible: f64,
-    /// Trained detector that makes masks for photographs without masks (default: masks rendered from the poses, without
-    /// occlusion)
+    /// Trained detector that makes masks for photographs without masks (default: masks rendered from the poses, without occlusion)
     #[arg(long, value_name = "FILE.safetensors")]
     pub detector: Option<PathBuf>,
     /// How the colours of several photographs are combined

@@ -126,13 +126,9 @@ pub(super) fn train_detector(a: &TrainDetectorArguments) -> Result<Summary<Learn
         preparing: "samples",
         measuring: "model measured",
         message: |record| {
-            format!(
-                "scores {:.3}, boxes {:.3}, masks {:.3}, {:.1} images/s",
-                loss(record, "scores"),
-                loss(record, "boxes"),
-                loss(record, "masks"),
-                record.samples_per_second
-            )
+            let [scores, boxes, masks] = ["scores", "boxes", "masks"].map(|name| loss(record, name));
+            let speed = record.samples_per_second;
+            format!("scores {scores:.3}, boxes {boxes:.3}, masks {masks:.3}, {speed:.1} images/s")
         },
     };
     let trained = train_in(&recipe, material, &a.out, a.export, shown)?;
