@@ -379,11 +379,11 @@ mod tests {
     use sixfold_mesh::Mesh;
 
     /// Scattered points with random normals: every feature is rare, and no reflection or rotation looks the same.
-    fn scattered() -> ObjectModel {
+    fn scattered(count: usize) -> ObjectModel {
         let mut random = ChaCha8Rng::seed_from_u64(4);
         let mut draw = || Vec3::from_fn(|_, _| random.random_range(-1.0..1.0));
-        let points: Vec<Vec3> = (0..80).map(|_| draw() * 0.05).collect();
-        let normals: Vec<Vec3> = (0..80).map(|_| draw().normalize()).collect();
+        let points: Vec<Vec3> = (0..count).map(|_| draw() * 0.05).collect();
+        let normals: Vec<Vec3> = (0..count).map(|_| draw().normalize()).collect();
         let mesh = Mesh::new(points.clone(), vec![]).unwrap();
         let description = Description {
             diameter: mesh.diameter(),
@@ -433,12 +433,15 @@ mod tests {
 
     #[test]
     fn scattered_points_vote_for_the_pose_they_were_moved_by() {
-        let model = scattered();
-        for twist in [[0.1, -0.2, 0.8, 0.5, -1.0, 0.3], [0.0, 0.1, 1.2, -2.0, 0.4, 1.1]] {
+        // One block of model points, and three.
+        let models = [80, 600].map(scattered);
+        assert_eq!(models.each_ref().map(|m| m.table.blocks), [1, 3]);
+        let twists = [[0.1, -0.2, 0.8, 0.5, -1.0, 0.3], [0.0, 0.1, 1.2, -2.0, 0.4, 1.1]];
+        for (model, twist) in models.iter().flat_map(|model| twists.map(|twist| (model, twist))) {
             let truth = Pose::exp(&twist.into());
             let cloud = model.samples.transformed(&truth);
             let options = VotingOptions { reference_stride: 1, ..VotingOptions::default() };
-            let votes = vote(&model, &cloud, &options);
+            let votes = vote(model, &cloud, &options);
             // Every point is a reference point here, and the best vote of most of them is the true pose.
             let best = votes.iter().map(|h| h.votes).fold(0.0, f32::max);
             let strong: Vec<_> = votes.iter().filter(|h| h.votes > 0.5 * best).collect();
