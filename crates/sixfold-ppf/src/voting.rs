@@ -432,6 +432,17 @@ mod tests {
     }
 
     #[test]
+    fn rows_without_entries_in_any_block_are_silent() {
+        let table = scattered(600).table;
+        let entries = |row: usize| &table.starts[row * table.blocks..=(row + 1) * table.blocks];
+        let empty: Vec<bool> =
+            (0..table.silent.len()).map(|row| entries(row)[0] == entries(row)[table.blocks]).collect();
+        let silent: Vec<bool> = table.silent.iter().map(|&s| s == u32::MAX).collect();
+        assert!(empty.contains(&true) && empty.contains(&false) && silent == empty);
+        assert!(table.silent.iter().all(|&s| s == 0 || s == u32::MAX));
+    }
+
+    #[test]
     fn scattered_points_vote_for_the_pose_they_were_moved_by() {
         // One block of model points, and three.
         let models = [80, 600].map(scattered);
