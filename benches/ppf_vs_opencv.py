@@ -5,7 +5,7 @@
 DATASET is a BOP dataset with depth, for instance what `sixfold simulate-depth` writes. Needs numpy and
 opencv-contrib-python-headless (OpenCV's contrib modules hold surface_matching). Both sides get the same scene points and normals
 (table removed, 2 mm grid) and the same model samples; OpenCV refines its five best poses with its own ICP and takes the
-one with the least residual, its documented way. A pose is correct with MSSD below 10 % of the diameter.
+one with the smallest residual, its documented way. A pose is correct with MSSD below 10 % of the diameter.
 """
 import json
 import pathlib

@@ -47,7 +47,7 @@ fn intersection(a: Vec2, along_a: Vec2, b: Vec2, along_b: Vec2) -> Option<Vec2> 
     (det.abs() > 1e-3 * scale).then(|| a + along_a * (cross(b - a, along_b) / det))
 }
 
-/// The quadrangle around a convex polygon: sides are removed one by one, each time the side whose removal adds the least area;
+/// The quadrangle around a convex polygon: sides are removed one by one, each time the side whose removal adds the smallest area;
 /// `None` if the result does not have the shape of a tag.
 pub(crate) fn around(hull: &[Vec2]) -> Option<Quad> {
     let mut polygon = hull.to_vec();

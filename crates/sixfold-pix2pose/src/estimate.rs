@@ -305,7 +305,7 @@ fn object_mask(prediction: &Prediction, threshold: f32) -> Vec<bool> {
     prediction.visible.iter().zip(&prediction.error).map(|(v, e)| *v > VISIBLE && *e < threshold).collect()
 }
 
-/// The mask dilated by its direct neighbours: thresholds remove the least certain pixels, which are at the border.
+/// The mask dilated by its direct neighbours: thresholds remove the most uncertain pixels, which are at the border.
 fn grown(mask: &[bool], side: usize) -> Vec<bool> {
     (0..mask.len())
         .map(|i| {
