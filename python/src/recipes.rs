@@ -355,13 +355,13 @@ pub(crate) fn train_views<'py>(
 /// Trains the network that refines poses of any object in colour images, on synthetic objects.
 ///
 /// out, progress, Ctrl-C and going on: as train_pix2pose. backgrounds: a folder of photographs for textures, backgrounds and
-/// occluders, synthetic ones only if None; batch: objects in a step, of each four poses.
+/// occluders, synthetic ones only if None; init: a model to continue from; batch: objects in a step, of each four poses.
 ///
 /// Raises OSError or ValueError for what cannot be read, options out of range, a folder with another training.
 ///
 /// >>> trained = train_refiner("out/refiner", steps=100)  # doctest: +SKIP
 #[pyfunction]
-#[pyo3(signature = (out, *, steps=None, learning_rate=None, batch=None, backgrounds=None, progress=None, seed=None))]
+#[pyo3(signature = (out, *, steps=None, learning_rate=None, batch=None, backgrounds=None, init=None, progress=None, seed=None))]
 #[allow(clippy::too_many_arguments)]
 pub(crate) fn train_refiner<'py>(
     py: Python<'py>,
@@ -370,12 +370,14 @@ pub(crate) fn train_refiner<'py>(
     learning_rate: Option<f64>,
     batch: Option<i64>,
     backgrounds: Option<PathBuf>,
+    init: Option<PathBuf>,
     progress: Option<Py<PyAny>>,
     seed: Option<i64>,
 ) -> PyResult<Bound<'py, PyDict>> {
     use sixfold::views::refiner::recipe::RefinerRecipe;
     let mut recipe = RefinerRecipe {
         backgrounds,
+        init,
         command: "sixfold.train_refiner".to_owned(),
         ..RefinerRecipe::default()
     };

@@ -7,7 +7,7 @@ use burn::tensor::Device;
 use sixfold_data::background_files;
 use sixfold_nn::fingerprint::Fingerprint;
 use sixfold_nn::options::OptionError;
-use sixfold_nn::recipe::{Prepared, Recipe, Session};
+use sixfold_nn::recipe::{Prepared, Recipe, Session, continued_from};
 use sixfold_nn::train_error::TrainError;
 use sixfold_nn::weights::{ModelCard, save_weights, write_card_markdown};
 use sixfold_synth::augment::Backgrounds;
@@ -25,6 +25,8 @@ pub struct RefinerRecipe {
     pub backgrounds: Option<PathBuf>,
     /// Steps, learning rate, seed, crops.
     pub options: RefinerTrainingOptions,
+    /// Weights of another training to continue from; random ones if `None`.
+    pub init: Option<PathBuf>,
     /// The command, for the model's card.
     pub command: String,
 }
@@ -54,11 +56,14 @@ impl Recipe for RefinerRecipe {
 
     fn inputs(&self, (): &()) -> Result<Fingerprint, TrainError> {
         // Every field by name, so that the compiler reports a new one; fields left out are in the options or have no effect.
-        let RefinerRecipe { backgrounds, options, command: _ } = self;
+        let RefinerRecipe { backgrounds, options, init, command: _ } = self;
         let backgrounds =
             background_files(backgrounds.as_deref()).map_err(TrainError::about("backgrounds"))?;
         let features = format!("{:016x}", shipped_hash());
-        Fingerprint::of(options)?.with("features", features).with_files("backgrounds", &backgrounds)
+        Fingerprint::of(options)?
+            .with("features", features)
+            .with_files("backgrounds", &backgrounds)?
+            .with_file("init", init.as_deref())
     }
 
     fn prepare(
@@ -67,12 +72,15 @@ impl Recipe for RefinerRecipe {
         _: &mut Session<'_>,
     ) -> Result<Prepared<RefinerTraining, Backgrounds>, TrainError> {
         let device = Device::flex().autodiff();
-        let network = RefinerNetwork::random(self.seed(), &device);
+        let network = match &self.init {
+            Some(path) => RefinerNetwork::load(path, &device)?.0,
+            None => RefinerNetwork::random(self.seed(), &device),
+        };
         let textures = textures(self.backgrounds.as_deref())?;
         let mut card = ModelCard::new(ARCHITECTURE, "Refiner of poses of known objects in colour images");
         card.data = format!("{}; features: those of the views within the program", described(&textures));
         let options = self.options.clone();
-        card.extra = serde_json::json!({ "training": options });
+        card.extra = serde_json::json!({ "training": options, "continued_from": continued_from(self.init.as_deref())? });
         Ok(Prepared { training: RefinerTraining::new(network, options, device), card, context: textures })
     }
 
@@ -122,6 +130,8 @@ mod tests {
         let before = of(&photographs);
         std::fs::write(folder.path().join("a.png"), b"two").unwrap();
         assert!(before.difference(&of(&photographs)).unwrap().starts_with("backgrounds was"));
+        let file = folder.path().join("a.png");
+        differs(RefinerRecipe { init: Some(file), ..RefinerRecipe::default() }, "init");
         let command = "another".to_owned();
         assert_eq!(of(&RefinerRecipe { command, ..RefinerRecipe::default() }), of(&RefinerRecipe::default()));
     }

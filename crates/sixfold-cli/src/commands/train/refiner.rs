@@ -25,6 +25,9 @@ pub(crate) struct TrainRefinerArguments {
     /// Maximum learning rate
     #[arg(long, value_name = "RATE", default_value_t = default().options.common.learning_rate)]
     pub learning_rate: f64,
+    /// Continue from the weights of another training (default: random weights)
+    #[arg(long, value_name = "FILE.safetensors")]
+    pub init: Option<PathBuf>,
     /// Objects in a step, with four poses each
     #[arg(long, value_name = "N", default_value_t = default().options.batch)]
     pub batch: usize,
@@ -42,7 +45,12 @@ impl TrainRefinerArguments {
         options.common.learning_rate = self.learning_rate;
         options.common.seed = self.seed;
         options.batch = self.batch;
-        RefinerRecipe { backgrounds: self.backgrounds.clone(), options, command: command_line() }
+        RefinerRecipe {
+            backgrounds: self.backgrounds.clone(),
+            options,
+            init: self.init.clone(),
+            command: command_line(),
+        }
     }
 }
 
