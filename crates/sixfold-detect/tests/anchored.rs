@@ -263,7 +263,7 @@ fn a_detector_gives_the_objects_of_its_labels() {
     assert_eq!((ids(&model), model.usage().threshold), (vec![1, 2, 3], 0.05));
     assert_eq!(model.card().training_frames, None);
     let image = pattern(90, 70);
-    let options = DetectOptions { most: 8, ..model.options() };
+    let options = DetectOptions { max_detections: 8, ..model.options() };
     let found = model.detect(&image, &options).unwrap();
     let expected = load(&weights(kind), &config(kind)).unwrap().detect(&image, &thresholds(kind), true);
     assert_eq!(found.len(), expected.len());
