@@ -13,6 +13,7 @@ use sixfold::mttm::{MatchedBy, MttmEstimator, MttmOptions};
 use sixfold::pix2pose::estimator::Pix2PoseEstimator;
 use sixfold::ppf::PpfEstimator;
 use sixfold::runner::RunOptions;
+use sixfold::views::ViewsRefiner;
 use sixfold::views::estimator::ViewsEstimator;
 
 use crate::arrays::bad;
@@ -162,6 +163,8 @@ pub(crate) fn make(py: Python<'_>, method: &str, options: &Options) -> PyResult<
                 estimator.options.looks = passes;
             }
             estimator.refine = options.refine;
+            let refiner = interruptible(py, |_| ViewsRefiner::shipped())?.map_err(|e| file_or_value(&e))?;
+            let mut estimator = estimator.with_refiner(Arc::new(refiner));
             estimator.icp = options.icp;
             let ids = estimator.model.objects().iter().map(|o| o.id).collect();
             (Arc::new(estimator), ids)

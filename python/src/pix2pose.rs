@@ -18,6 +18,7 @@ use sixfold::pix2pose::estimate::{EstimateError, Found, Pix2PoseOptions};
 use sixfold::pix2pose::estimator::{self, Pix2PoseEstimator, Pix2PoseObject};
 use sixfold::pix2pose::model::{ModelError, Pix2PoseModel};
 use sixfold::runner::describe;
+use sixfold::views::ViewsRefiner;
 
 use crate::arrays::{self, about, bad, positive, seed};
 use crate::camera::PyCamera;
@@ -165,7 +166,9 @@ impl Pix2Pose {
         meshes: Option<BTreeMap<u32, Py<PyMesh>>>,
     ) -> PyResult<Self> {
         let model = interruptible(py, move |_| Pix2PoseModel::load(&path))?.map_err(model_error)?;
-        let estimator = Pix2PoseEstimator::new(model);
+        let refiner = interruptible(py, |_| ViewsRefiner::shipped())?;
+        let refiner = refiner.map_err(|e| PyValueError::new_err(describe(&e)))?;
+        let estimator = Pix2PoseEstimator::new(model).with_refiner(Arc::new(refiner));
         let meshes = meshes_of(&estimator, meshes)?;
         Ok(Pix2Pose { estimator, camera, meshes })
     }
@@ -304,6 +307,7 @@ impl Pix2Pose {
                 EstimateError::Size { .. } => "rgb",
                 EstimateError::Distorted => "camera",
                 EstimateError::Model(_) => "object_ids",
+                EstimateError::Refiner(_) => "meshes",
             };
             PyValueError::new_err(format!("{argument}: {error}"))
         })?;

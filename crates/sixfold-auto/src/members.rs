@@ -10,6 +10,7 @@ use sixfold_mttm::model::MttmModel;
 use sixfold_mttm::{MttmEstimator, MttmOptions};
 use sixfold_pix2pose::estimator::Pix2PoseEstimator;
 use sixfold_ppf::PpfEstimator;
+use sixfold_views::ViewsRefiner;
 use sixfold_views::estimator::ViewsEstimator;
 
 use crate::estimator::AutoEstimator;
@@ -47,7 +48,8 @@ impl AutoMembers<'_> {
             let mut trained = Pix2PoseEstimator::load(weights).map_err(EstimatorError::method)?;
             trained.options.estimate.seed = self.seed;
             trained.object_id = object_id;
-            members.push(Arc::new(trained));
+            let refiner = ViewsRefiner::shipped().map_err(EstimatorError::method)?;
+            members.push(Arc::new(trained.with_refiner(Arc::new(refiner))));
         }
         if !self.without_views {
             let mut views = ViewsEstimator::shipped().map_err(EstimatorError::method)?;

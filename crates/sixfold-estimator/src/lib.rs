@@ -14,6 +14,7 @@ mod estimate;
 mod method;
 mod object;
 mod query;
+mod refiner;
 mod region;
 mod store;
 
@@ -24,5 +25,6 @@ pub use estimate::{Diagnostic, PoseEstimate};
 pub use method::{MinConfidence, Need, Needs, PoseEstimator, PreparedObject, downcast};
 pub use object::Object;
 pub use query::{Memo, Query, check_min_confidence};
+pub use refiner::{PoseRefiner, RefinedObject, RefinedPose};
 pub use region::Region;
 pub use store::{FreeAxis, NewObject, ObjectRecord, ObjectStore, StoreError};

@@ -7,7 +7,7 @@ use sixfold_bop::{
     BopDataset, ModelPoints, Models, Placement, VISIBILITY_DELTA, add, adi, ground_truth_visibility,
 };
 use sixfold_geometry::{Camera, Pose, Rect, RgbImage};
-use sixfold_pix2pose::aligned::{AlignOptions, estimate_aligned};
+use sixfold_pix2pose::aligned::{AlignOptions, AlignedObject, estimate_aligned};
 use sixfold_pix2pose::estimate::{Found, Pix2PoseOptions, estimate};
 use sixfold_pix2pose::model::Pix2PoseModel;
 use sixfold_pix2pose::refine::{OutlineRefinementOptions, refine};
@@ -127,9 +127,9 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         let errors: Vec<_> = cases
             .par_iter()
             .map(|c| {
-                let mesh = &meshes[&c.object].1;
-                let found =
-                    estimate_aligned(&model, &c.image, &c.camera, c.object, &c.region, mesh, &options);
+                let outline = &meshes[&c.object].1;
+                let object = AlignedObject { id: c.object, outline, refiner: None };
+                let found = estimate_aligned(&model, &c.image, &c.camera, object, &c.region, &options);
                 let pose = found.ok().flatten().map_or(Pose::identity(), |a| a.camera_from_object);
                 measured(c, &pose)
             })

@@ -164,6 +164,9 @@ pub enum EstimateError {
     /// The image has lens distortion.
     #[error("the camera has lens distortion: undistort image and camera first")]
     Distorted,
+    /// The refiner failed.
+    #[error(transparent)]
+    Refiner(Box<sixfold_estimator::EstimatorError>),
 }
 
 /// A pose with its inliers and score.

@@ -7,13 +7,13 @@ use serde_json::{Map, Value, json};
 use sixfold_align::DepthOptions;
 use sixfold_align::outline::outline_mesh;
 use sixfold_estimator::{
-    Diagnostic, EstimatorError, Need, Needs, Object, PoseEstimate, PoseEstimator, PreparedObject, Query,
-    downcast,
+    Diagnostic, EstimatorError, Need, Needs, Object, PoseEstimate, PoseEstimator, PoseRefiner,
+    PreparedObject, Query, RefinedObject, downcast,
 };
 use sixfold_geometry::{Camera, Image, NormalOptions, Pose, Rect, RgbImage, Vec3};
 use sixfold_mesh::Mesh;
 
-use crate::aligned::{AlignOptions, estimate_aligned};
+use crate::aligned::{AlignOptions, AlignedObject, estimate_aligned};
 use crate::depth::align;
 use crate::estimate::{EstimateError, Found, Pix2PoseOptions, View, estimate};
 use crate::model::Pix2PoseModel;
@@ -34,6 +34,8 @@ pub struct Pix2PoseEstimator {
     pub icp: bool,
     /// Id of the model's object, for objects that do not give one; `None`: its only object.
     pub object_id: Option<u32>,
+    /// Refines aligned poses.
+    pub refiner: Option<Arc<dyn PoseRefiner>>,
 }
 
 impl Pix2PoseEstimator {
@@ -53,7 +55,14 @@ impl Pix2PoseEstimator {
             refine: true,
             icp: false,
             object_id: None,
+            refiner: None,
         }
+    }
+
+    /// Refines aligned poses by `refiner` too ([`AlignOptions::refiner_weight`]).
+    #[must_use]
+    pub fn with_refiner(self, refiner: Arc<dyn PoseRefiner>) -> Pix2PoseEstimator {
+        Pix2PoseEstimator { refiner: Some(refiner), ..self }
     }
 
     /// The same in the dissertation's form: its two stages with its parameters, one pass, no alignment of the outline.
@@ -108,6 +117,7 @@ impl Pix2PoseEstimator {
             mesh: object.mesh.clone(),
             solid: if object.mesh.is_none() { box_of(entry) } else { None },
             outline: OnceLock::new(),
+            refined: OnceLock::new(),
             notes,
         })
     }
@@ -127,12 +137,14 @@ impl Pix2PoseEstimator {
         let id = object.id;
         if let (true, Some(mesh)) = (self.refine, &object.mesh) {
             let outline = object.outline.get_or_init(|| outline_mesh(mesh));
-            let (model, options) = (&self.model, &self.options);
-            let aligned = estimate_aligned(model, image, camera, id, bbox, outline, options)?;
+            let refined = self.refiner.as_ref().map(|by| object.refined.get_or_init(|| by.object(mesh)));
+            let known = AlignedObject { id, outline, refiner: refined.map(AsRef::as_ref) };
+            let aligned = estimate_aligned(&self.model, image, camera, known, bbox, &self.options)?;
             return Ok(aligned.map(|a| Pix2PosePose {
                 camera_from_object: a.camera_from_object,
                 score: a.score,
                 refined: a.improved,
+                agreement: a.agreement,
                 found: a.found,
             }));
         }
@@ -140,7 +152,7 @@ impl Pix2PoseEstimator {
         Ok(found.and_then(|found| {
             let best = found.hypotheses.first()?;
             let (score, camera_from_object) = (best.score, best.camera_from_object);
-            Some(Pix2PosePose { camera_from_object, score, refined: false, found })
+            Some(Pix2PosePose { camera_from_object, score, refined: false, agreement: None, found })
         }))
     }
 }
@@ -154,6 +166,8 @@ pub struct Pix2PosePose {
     pub score: f64,
     /// Whether the outline was aligned with the image.
     pub refined: bool,
+    /// Agreement of the image with the refined pose, 0 to 1, if a refiner found one.
+    pub agreement: Option<f64>,
     /// The result of both passes.
     pub found: Found,
 }
@@ -167,6 +181,7 @@ pub struct Pix2PoseObject {
     /// The bounding box of the model's coordinates, for overlays without a mesh.
     solid: Option<Mesh>,
     outline: OnceLock<Mesh>,
+    refined: OnceLock<Arc<dyn RefinedObject>>,
     notes: Vec<String>,
 }
 
@@ -280,6 +295,7 @@ fn details(id: u32, posed: &Pix2PosePose, icp: Value) -> Map<String, Value> {
     Map::from_iter([
         ("object_id".to_owned(), id.into()),
         ("refined".to_owned(), posed.refined.into()),
+        ("agreement".to_owned(), json!(posed.agreement)),
         ("icp".to_owned(), icp),
         ("window".to_owned(), json!([window.x, window.y, window.width])),
         ("hypotheses".to_owned(), hypotheses.into()),

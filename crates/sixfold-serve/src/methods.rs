@@ -275,6 +275,7 @@ mod with_networks {
     use sixfold_auto::AutoMembers;
     use sixfold_detect::detector::TrainedDetector;
     use sixfold_pix2pose::estimator::Pix2PoseEstimator;
+    use sixfold_views::ViewsRefiner;
     use sixfold_views::estimator::ViewsEstimator;
 
     pub const ADVICE: &str = "pix2pose needs a trained model: start the server with --pix2pose FILE.safetensors; else choose one of them";
@@ -298,7 +299,8 @@ mod with_networks {
         if let Some(file) = pix2pose {
             let build = move || {
                 let trained = Pix2PoseEstimator::load(&file).map_err(EstimatorError::method)?;
-                Ok(Arc::new(trained) as Estimator)
+                let refiner = ViewsRefiner::shipped().map_err(EstimatorError::method)?;
+                Ok(Arc::new(trained.with_refiner(Arc::new(refiner))) as Estimator)
             };
             let method = Method::new("pix2pose", "object coordinates by a trained network, in boxes", build);
             method

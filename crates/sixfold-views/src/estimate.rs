@@ -208,7 +208,7 @@ impl Views<'_> {
     }
 
     /// A pose refined in a crop of higher resolution around the whole object at this pose, with its outline aligned there.
-    fn closer(
+    pub(crate) fn closer(
         &self,
         hypothesis: Hypothesis,
         image: &RgbImage,

@@ -3,6 +3,7 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Instant;
 
 use anyhow::{Result, bail};
@@ -11,6 +12,7 @@ use sixfold_data::FrameId;
 use sixfold_detect::detector::TrainedDetector;
 use sixfold_pix2pose::estimator::{Pix2PoseEstimator, Pix2PoseObject};
 use sixfold_runner::RegionSource;
+use sixfold_views::ViewsRefiner;
 
 use super::SamplePose;
 use super::colour::Colour;
@@ -42,7 +44,9 @@ pub(super) fn run(
             Err(error) => return Ok(Colour::none(Some(weights), crate::describe(&error.into()))),
         },
     };
+    let refiner = ViewsRefiner::shipped()?;
     let result = Pix2PoseEstimator::load(&weights)
+        .map(|pix2pose| pix2pose.with_refiner(Arc::new(refiner)))
         .map_err(anyhow::Error::from)
         .and_then(|pix2pose| with_model(out, &pix2pose, &weights, detector, dataset, targets, known));
     match result {

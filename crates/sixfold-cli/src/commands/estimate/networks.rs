@@ -18,6 +18,7 @@ use sixfold_mttm::{MatchedBy, MttmEstimator};
 use sixfold_pix2pose::estimator::Pix2PoseEstimator;
 use sixfold_runner::RegionSource;
 use sixfold_shell::ranges::{self, count};
+use sixfold_views::ViewsRefiner;
 use sixfold_views::estimator::ViewsEstimator;
 
 use super::arguments::CommonArguments;
@@ -138,6 +139,10 @@ impl MethodArguments for Pix2PoseArguments {
         estimator.refine &= !self.no_refine;
         estimator.icp = self.icp;
         estimator.object_id = common.object_id;
+        if estimator.refine {
+            let refiner = ViewsRefiner::shipped().context("the refiner within the program")?;
+            estimator = estimator.with_refiner(Arc::new(refiner));
+        }
         Ok(Box::new(estimator))
     }
 }

@@ -220,7 +220,8 @@ pub(crate) fn run(a: &ReproducePix2PoseArguments, json: &JsonArguments) -> Resul
 fn settings(bench: &Bench) -> Vec<Setting> {
     let plain = Setting::plain;
     let mut all = vec![
-        Setting { refine: true, ..plain("default", "two stages, PnP, outline aligned (default)") },
+        Setting { refine: true, ..plain("default", "two stages, PnP, outline aligned, refined (default)") },
+        Setting { refine: true, refiner: false, ..plain("no-refiner", "default, without the refiner") },
         Setting {
             refine: true,
             correct: false,

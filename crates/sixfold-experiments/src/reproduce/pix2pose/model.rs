@@ -11,6 +11,7 @@ use sixfold_mesh::{Mesh, ModelInfo};
 use sixfold_pix2pose::aligned::AlignOptions;
 use sixfold_pix2pose::estimator::{Pix2PoseEstimator, Pix2PoseObject, Pix2PosePose};
 use sixfold_pix2pose::model::Pix2PoseModel;
+use sixfold_views::ViewsRefiner;
 
 /// A model with options, and its objects, prepared when first needed.
 #[derive(Clone)]
@@ -22,7 +23,8 @@ pub(super) struct Pix2Pose {
 impl Pix2Pose {
     /// The model of a weight file with the default options.
     pub fn load(weights: &Path) -> Result<Pix2Pose> {
-        Ok(Pix2Pose { estimator: Pix2PoseEstimator::load(weights)?, objects: Arc::default() })
+        let estimator = Pix2PoseEstimator::load(weights)?.with_refiner(Arc::new(ViewsRefiner::shipped()?));
+        Ok(Pix2Pose { estimator, objects: Arc::default() })
     }
 
     /// The same model with other options.

@@ -30,6 +30,8 @@ pub(super) struct Setting {
     pub looks: usize,
     /// With refinement: whether the model's known systematic error is corrected.
     pub correct: bool,
+    /// With refinement: whether the refiner refines the aligned pose.
+    pub refiner: bool,
     /// With refinement: whether borders are attracted to edges of the image.
     pub edges: bool,
     /// Ground-truth boxes are moved and scaled by up to this fraction of their size.
@@ -107,6 +109,7 @@ impl Setting {
             refine: false,
             looks: AlignOptions::default().looks,
             correct: true,
+            refiner: true,
             edges: true,
             noise: None,
             half_black: false,
@@ -122,6 +125,9 @@ impl Setting {
             correct: self.correct,
             ..AlignOptions::default()
         };
+        if !self.refiner {
+            options.refiner_weight = 0.0;
+        }
         if !self.edges {
             options.refine.edges = 0.0;
         }
