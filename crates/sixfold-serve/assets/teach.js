@@ -356,7 +356,7 @@ function showActions() {
   byId("accept").hidden = shown.state !== "taught";
   byId("run").hidden = !["ready", "failed"].includes(shown.state) && !scaleIsNew();
   byId("run").disabled = !hasScale(shown) && !scaleIsNew();
-  byId("run").textContent = shown.mesh || shown.camera ? "Continue" : "Begin";
+  byId("run").textContent = shown.mesh || shown.rms !== null ? "Continue" : "Begin";
   byId("more").hidden = busy || !(files || changed);
   byId("more").textContent = files ? "Add the chosen files" : "Apply the settings";
   byId("find-link").hidden = !shown.object;

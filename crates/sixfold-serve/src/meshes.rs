@@ -68,9 +68,11 @@ impl MeshFormat {
             )),
         };
         let wrong = |e: &dyn std::fmt::Display| {
+            // The library's messages name the command line's options.
+            let text = e.to_string().replace("--unit ", "unit=");
             ApiError::about(
                 "mesh",
-                e,
+                text,
                 "a mesh of an object of 5 mm to 5 m",
                 "repair or convert the file, and check its unit",
             )

@@ -67,7 +67,7 @@ fn invalid_scales_and_meshes_are_refused_with_advice() {
         (with_mesh(), "unit", "nothing"),
         (plain().text("unit", "mm"), "unit", "without a mesh"),
         (with_mesh().text("unit", "yards"), "unit", "m, cm, mm, in"),
-        (with_mesh().text("unit", "m"), "mesh", "147"),
+        (with_mesh().text("unit", "m"), "mesh", "140 mm if the file is in millimetres: give unit=mm"),
         (with_mesh().text("unit", "mm").text("hull_only", "true"), "hull_only", "with a mesh"),
         (plain().file("mesh", "body.step", &mesh).text("unit", "mm"), "mesh", ".ply, .obj"),
         (plain().file("mesh", "body.ply", b"text").text("unit", "mm"), "mesh", "mesh: "),
