@@ -353,6 +353,8 @@ export class Editor {
     byId("nearer").addEventListener("click", () => this.farther(1 / 1.01));
     byId("farther").addEventListener("click", () => this.farther(1.01));
     byId("whole").addEventListener("change", () => this.frame());
+    // Marks are as large on every screen.
+    window.addEventListener("resize", () => this.dialog.open && this.draw());
     byId("editor-close").addEventListener("click", () => this.dialog.close());
     byId("pose-reset").addEventListener("click", () => {
       this.pose = this.saved;

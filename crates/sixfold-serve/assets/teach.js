@@ -312,8 +312,10 @@ function captionOf(teaching, photograph) {
 
 function tile(teaching, photograph) {
   const { caption, text } = captionOf(teaching, photograph);
+  // Before the object is found the whole photograph is shown.
+  const part = photograph.links.mask || teaching.mesh ? "side=220&close_up=true" : "side=320";
   const made = element("button", { type: "button", className: "tile" }, [
-    element("img", { src: `${photograph.links.overlay}&side=220&close_up=true`, alt: "", loading: "lazy" }),
+    element("img", { src: `${photograph.links.overlay}&${part}`, alt: "", loading: "lazy" }),
     element("span", { className: "name" }, [photograph.name]),
     element("span", { className: text ? "reason" : "muted small" }, [caption]),
   ]);

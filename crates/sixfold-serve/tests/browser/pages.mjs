@@ -423,7 +423,8 @@ async function teachWithoutBoard(page, address) {
     const expected = truth[i][end];
     if (!expected) return assert.equal(point, null);
     const far = Math.hypot(point[0] - expected[0], point[1] - expected[1]);
-    return assert(far < 1, `end ${end + 1} of mark ${i}: ${far.toFixed(2)} pixels from where it is`);
+    // The browser reports the pointer in whole pixels of the screen.
+    return assert(far < 1.5, `end ${end + 1} of mark ${i}: ${far.toFixed(2)} pixels from where it is`);
   }));
   await shot(page, "teach-scale");
   await page.getByRole("button", { name: "Begin" }).click();
