@@ -396,16 +396,22 @@ export class Editor {
     return this.ends.of(this.number).map((p) => p && [(p[0] + 0.5) * kx - 0.5, (p[1] + 0.5) * ky - 0.5]);
   }
 
+  /** Width and height of the photograph. */
+  fullSize() {
+    return [this.photograph.width || this.taken.naturalWidth, this.photograph.height || this.taken.naturalHeight];
+  }
+
   /** Pixels of the shown image for a pixel of the photograph. */
   fromFull() {
-    return [this.taken.naturalWidth / this.photograph.width, this.taken.naturalHeight / this.photograph.height];
+    const [width, height] = this.fullSize();
+    return [this.taken.naturalWidth / width, this.taken.naturalHeight / height];
   }
 
   /** Marks the chosen end at a pixel of the shown image, or removes its mark. */
   setEnd(pixel) {
     if (!this.taken) return;
     const [kx, ky] = this.fromFull();
-    const { width, height } = this.photograph;
+    const [width, height] = this.fullSize();
     const within = (v, size) => Math.min(Math.max(v, -0.5), size - 0.5);
     const full = pixel && [within((pixel[0] + 0.5) / kx - 0.5, width), within((pixel[1] + 0.5) / ky - 0.5, height)];
     this.ends.set(this.number, this.end, full);

@@ -7,7 +7,7 @@ use sixfold_board::{Board, Paper};
 use sixfold_geometry::Camera;
 use sixfold_io::{CameraFile, ImageFile};
 use sixfold_mesh::Mesh;
-use sixfold_teach::{KnownLength, Snapshot, TeachOptions, Teaching, World, photograph_name};
+use sixfold_teach::{KnownLength, Photograph, Snapshot, TeachOptions, Teaching, World, photograph_name};
 
 use super::of_teach;
 use super::scale::{NamedSize, Scale};
@@ -137,9 +137,13 @@ pub(super) struct Before {
 impl Before {
     pub fn of(known: &Snapshot, hull_only: bool) -> Before {
         let all = known.photographs();
+        let size_of = |i: usize| ImageFile::new(&known.photograph_file(i).ok()?).size().ok();
+        let sized = |(i, p): (usize, &Photograph)| {
+            (p.name.clone(), p.size.or_else(|| size_of(i)).unwrap_or_default())
+        };
         Before {
             options: known.options(),
-            photographs: all.iter().map(|p| (p.name.clone(), p.size.unwrap_or_default())).collect(),
+            photographs: all.iter().enumerate().map(sized).collect(),
             with_depth: all.iter().any(|p| p.depth.is_some()),
             length: known.length().cloned(),
             has_mesh: known.has_given_mesh(),

@@ -268,7 +268,7 @@ fn in_fields(field: &str, error: &TeachError, expected: &str, advice: &str) -> A
 /// An error of the library as an answer to the client, without paths of this machine.
 pub(crate) fn of_teach(error: &TeachError) -> ApiError {
     let photographs = |expected: &str, advice: &str| in_fields("photographs", error, expected, advice);
-    let sides = "photographs of one object, on the printed board or without_board, from all sides";
+    let sides = "photographs of one object from all sides, on the printed board or with without_board=true";
     let marks = "each end of the length marked in two or more photographs, from different sides";
     let last = |path: &Path| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
     match error {

@@ -79,8 +79,11 @@ fn step(
     }
 }
 
-/// Reports too few photographs before anything is searched in them.
+/// Reports too few photographs on the board before anything is searched in them. Without a board the first step reports them.
 fn check_number(teaching: &Teaching) -> Result<(), TeachError> {
+    if teaching.options().world == World::Features {
+        return Ok(());
+    }
     let used = || teaching.photographs().iter().filter(|p| !p.left_out_by_person);
     let minimum = if used().any(|p| p.depth.is_some()) { FEWEST_WITH_DEPTH } else { FEWEST_PHOTOGRAPHS };
     let found = used().count();
