@@ -429,7 +429,7 @@ async function teachWithoutBoard(page, address) {
   await shot(page, "teach-scale");
   await page.getByRole("button", { name: "Begin" }).click();
   await page.getByText(/Working: finding poses/).waitFor({ timeout: 60000 });
-  await page.locator('#state[data-state="taught"]').waitFor({ timeout: 300000 });
+  await page.locator('#state[data-state="taught"]').waitFor({ timeout: 600000 });
   const { mesh, rms } = await teachingOf(page, address);
   const ratio = mesh.diameter / 0.109;
   assert(Math.abs(ratio - 1) < 0.06 && rms < 2, `diameter ${mesh.diameter} m, features ${rms} pixels off`);
@@ -445,7 +445,7 @@ async function teachWithoutBoard(page, address) {
   await page.getByLabel("Do not search for hollows").uncheck();
   await page.getByRole("button", { name: "Add the chosen files" }).click();
   await page.getByText(/Working: making the mesh/).waitFor({ timeout: 60000 });
-  await page.locator('#state[data-state="taught"]').waitFor({ timeout: 300000 });
+  await page.locator('#state[data-state="taught"]').waitFor({ timeout: 600000 });
   const given = await teachingOf(page, address);
   assert(given.given_mesh && Math.abs(given.mesh.diameter - 0.1089) < 0.001, `a mesh of ${given.mesh.diameter} m`);
   await shot(page, "teach-mesh");
