@@ -70,7 +70,7 @@ pub(crate) fn run(a: &SynthesizeArguments) -> Result<Outcome> {
     let folder = DatasetFolder::take(&a.out, "synthesize", a.deciding(), &inputs)?;
     let mut images = input::read(a)?;
     if images.objects.is_empty() {
-        bail!("no photograph shows any of the objects; choose other --frames or a lower --least-visible");
+        bail!("no photograph shows any of the objects; choose other --frames or a lower --min-visible");
     }
     folder.begin(&input::contents(a, &images)?)?;
     for object in &mut images.objects {
@@ -244,7 +244,7 @@ fn table(a: &SynthesizeArguments, summary: &Summary) {
     let out = a.out.display();
     println!("{out}/preview.png: new views; {out}/poses.png: outlines at the given and the refined poses");
     println!(
-        "next: sixfold train pix2pose --dataset {out} --split {} --render-share 0 --out DIR",
+        "next: sixfold train pix2pose --dataset {out} --split {} --render-fraction 0 --out DIR",
         a.new_split
     );
 }
