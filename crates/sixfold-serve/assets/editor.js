@@ -1,4 +1,5 @@
-// Correcting a photograph: its pose by dragging the mesh or by marking points, its mask with a brush.
+// Correcting a photograph: its pose by dragging the mesh or by marking points, its mask with a brush; and the two ends of a measured
+// length, for photographs without a board.
 
 import { ask, byId, element, json, showProblem } from "/static/api.js";
 import { apply, cameraOf, identity, inverse, product, project, ray, rotationAbout, translation } from "/static/pose.js";
@@ -10,12 +11,20 @@ const MESH = "rgb(0, 200, 255)";
 const MARK = "rgb(225, 20, 130)";
 /** Radians for a pixel of dragging. */
 const ROTATION = 0.006;
+/** Images in which ends are marked have at most this many pixels. */
+const FINE_SIDE = 2048;
+/** A mark is taken hold of within this distance, pixels of the screen. */
+const REACH = 14;
+/** The smallest part of a photograph that is shown, pixels. */
+const CLOSEST = 40;
 /** Strokes that can be undone. */
 const UNDOS = 20;
 
+const TOOLS = ["ends", "pose", "points", "mask"];
 const HINTS = {
+  ends: "Click at the two ends of the measured length; drag a mark to move it. The wheel zooms. Leave out an end that the photograph does not show.",
   pose: "Drag moves the mesh, with the right button or Shift it rotates, with Alt it rolls; the wheel changes the distance. Arrow keys move by a pixel.",
-  points: "Mark a point of the object or the board in the other photograph, then the same point in this one. Three pairs or more give the pose.",
+  points: "Mark a point of the object or of the ground beside it in the other photograph, then the same point in this one. Three pairs or more give the pose.",
   mask: "Paint the object; with the right button or Shift the brush erases.",
 };
 
@@ -40,10 +49,10 @@ class Pane {
     this.context = canvas.getContext("2d");
   }
 
-  /** Shows an image; `part` is [x, y, width, height] in its pixels. */
-  show(image, part) {
+  /** Shows an image, enlarged at most so many times; `part` is [x, y, width, height] in its pixels. */
+  show(image, part, most = 3) {
     Object.assign(this, { image, part });
-    const scale = Math.min(SIDE / Math.max(part[2], part[3]), 3);
+    const scale = Math.min(SIDE / Math.max(part[2], part[3]), most);
     this.canvas.width = Math.round(part[2] * scale);
     this.canvas.height = Math.round(part[3] * scale);
     this.scale = this.canvas.width / part[2];
@@ -121,10 +130,12 @@ class Pane {
   }
 }
 
-/** The dialog. `changed` is called with the teaching after each correction. */
+/** The dialog. `changed` is called with the teaching after each correction; `ends` keeps the marks of the measured length. */
 export class Editor {
-  constructor(changed) {
+  constructor(changed, ends) {
     this.changed = changed;
+    this.ends = ends;
+    this.end = 0;
     this.pane = new Pane(byId("canvas"));
     this.other = new Pane(byId("reference"));
     this.dialog = byId("editor");
@@ -134,9 +145,10 @@ export class Editor {
   }
 
   /** Opens a photograph of a teaching. `shape` is the mesh, or null. */
-  async open(teaching, number, shape) {
+  async open(teaching, number, shape, tool = null) {
     Object.assign(this, { teaching, number, shape, pairs: [], point: null, strokes: [], pointers: new Map() });
     this.photograph = teaching.photographs[number];
+    Object.assign(this, { taken: null, held: null });
     byId("editor-name").textContent = this.photograph.name;
     byId("editor-status").replaceChildren();
     const out = this.photograph.state === "left_out_by_person";
@@ -157,7 +169,9 @@ export class Editor {
     byId("tab-pose").disabled = byId("tab-points").disabled = !this.camera || !this.pose;
     byId("mask-mesh").disabled = !this.shape || !this.pose || !this.camera;
     byId("whole").checked = false;
-    this.tab(this.camera && this.pose ? "pose" : "mask");
+    byId("tab-ends").hidden = !teaching.without_board;
+    const usual = this.camera && this.pose ? "pose" : teaching.without_board ? "ends" : "mask";
+    await this.tab(tool || usual);
     this.dialog.dataset.shown = String(number);
   }
 
@@ -179,18 +193,35 @@ export class Editor {
     this.others = others;
   }
 
-  tab(name) {
+  async tab(name) {
     this.tool = name;
-    for (const tool of ["pose", "points", "mask"]) {
+    for (const tool of TOOLS) {
       byId(`tab-${tool}`).setAttribute("aria-selected", String(tool === name));
       byId(`tools-${tool}`).hidden = tool !== name;
     }
     byId("editor-hint").textContent = HINTS[name];
     byId("reference").hidden = name !== "points";
-    byId("whole").parentElement.hidden = name === "points";
+    byId("whole").parentElement.hidden = name === "points" || name === "ends";
     this.dialog.classList.toggle("two", name === "points");
-    if (name === "points") this.showOther().catch((problem) => showProblem(byId("editor-status"), problem));
+    try {
+      if (name === "points") await this.showOther();
+      if (name === "ends") await this.showTaken();
+    } catch (problem) {
+      showProblem(byId("editor-status"), problem);
+    }
     this.frame();
+  }
+
+  /** The photograph with its lens distortion, for the ends of the length. */
+  async showTaken() {
+    const number = this.number;
+    const image = await loaded(`${this.photograph.links.image}&side=${FINE_SIDE}&as_taken=true`);
+    if (number !== this.number) return;
+    this.taken = image;
+    const [first, second] = this.ends.of(number);
+    this.chooseEnd(first && !second ? 1 : 0);
+    byId("ends-previous").disabled = number === 0;
+    byId("ends-next").disabled = number + 1 === this.teaching.photographs.length;
   }
 
   /** The pixels around the object, or all. */
@@ -215,13 +246,19 @@ export class Editor {
   }
 
   frame() {
-    this.pane.show(this.image, this.part());
+    if (this.tool === "ends") {
+      if (this.taken) this.pane.show(this.taken, [0, 0, this.taken.naturalWidth, this.taken.naturalHeight], Infinity);
+    } else {
+      this.pane.show(this.image, this.part());
+    }
     this.draw();
   }
 
   draw() {
     this.pane.draw((c) => {
-      if (this.tool === "mask") {
+      if (this.tool === "ends") {
+        this.marks().forEach((pixel, end) => pixel && this.pane.mark(pixel, end + 1, MARK));
+      } else if (this.tool === "mask") {
         c.globalAlpha = 0.45;
         c.drawImage(this.mask, 0, 0);
         c.globalAlpha = 1;
@@ -277,7 +314,7 @@ export class Editor {
 
   listen() {
     const canvas = this.pane.canvas;
-    for (const tool of ["pose", "points", "mask"]) byId(`tab-${tool}`).addEventListener("click", () => this.tab(tool));
+    for (const tool of TOOLS) byId(`tab-${tool}`).addEventListener("click", () => this.tab(tool));
     const choose = (group, key) => byId(group).addEventListener("click", (event) => {
       const value = event.target.dataset[key];
       if (!value) return;
@@ -290,15 +327,23 @@ export class Editor {
     canvas.addEventListener("pointerdown", (event) => this.down(event));
     canvas.addEventListener("pointermove", (event) => this.moved(event));
     for (const name of ["pointerup", "pointercancel"]) {
-      canvas.addEventListener(name, (event) => this.pointers.delete(event.pointerId));
+      canvas.addEventListener(name, (event) => {
+        this.pointers.delete(event.pointerId);
+        this.held = null;
+      });
     }
     canvas.addEventListener("wheel", (event) => {
+      if (this.tool === "ends") {
+        event.preventDefault();
+        this.zoom(Math.exp(0.0015 * event.deltaY), this.pane.pixel(event));
+      }
       if (this.tool !== "pose") return;
       event.preventDefault();
       this.farther(Math.exp(0.0006 * event.deltaY));
     }, { passive: false });
     canvas.addEventListener("keydown", (event) => {
       const steps = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
+      if (this.tool === "ends") this.endKey(event, steps[event.key]);
       if (this.tool !== "pose" || !steps[event.key]) return;
       event.preventDefault();
       this.dragged(event.shiftKey ? "rotate" : this.drag, ...steps[event.key]);
@@ -308,6 +353,8 @@ export class Editor {
     byId("nearer").addEventListener("click", () => this.farther(1 / 1.01));
     byId("farther").addEventListener("click", () => this.farther(1.01));
     byId("whole").addEventListener("change", () => this.frame());
+    // Marks are as large on every screen.
+    window.addEventListener("resize", () => this.dialog.open && this.draw());
     byId("editor-close").addEventListener("click", () => this.dialog.close());
     byId("pose-reset").addEventListener("click", () => {
       this.pose = this.saved;
@@ -318,8 +365,101 @@ export class Editor {
       else this.pairs.pop();
       this.draw();
     });
+    this.listenForEnds();
     this.listenForMask();
     this.listenForSaves();
+  }
+
+  listenForEnds() {
+    byId("ends").addEventListener("click", (event) => {
+      if (event.target.dataset.end) this.chooseEnd(Number(event.target.dataset.end));
+    });
+    byId("end-remove").addEventListener("click", () => this.setEnd(null));
+    byId("zoom-in").addEventListener("click", () => this.zoom(0.5));
+    byId("zoom-out").addEventListener("click", () => this.zoom(2));
+    const open = (number) => this.open(this.teaching, number, this.shape, "ends").catch((problem) => showProblem(byId("editor-status"), problem));
+    byId("ends-previous").addEventListener("click", () => open(this.number - 1));
+    byId("ends-next").addEventListener("click", () => open(this.number + 1));
+  }
+
+  /** Which end clicks and keys are about. */
+  chooseEnd(end) {
+    this.end = end;
+    for (const button of byId("ends").children) button.setAttribute("aria-pressed", String(Number(button.dataset.end) === end));
+    byId("end-remove").disabled = !this.ends.of(this.number)[end];
+  }
+
+  /** The marked ends in pixels of the shown image. */
+  marks() {
+    if (!this.taken) return [null, null];
+    const [kx, ky] = this.fromFull();
+    return this.ends.of(this.number).map((p) => p && [(p[0] + 0.5) * kx - 0.5, (p[1] + 0.5) * ky - 0.5]);
+  }
+
+  /** Width and height of the photograph. */
+  fullSize() {
+    return [this.photograph.width || this.taken.naturalWidth, this.photograph.height || this.taken.naturalHeight];
+  }
+
+  /** Pixels of the shown image for a pixel of the photograph. */
+  fromFull() {
+    const [width, height] = this.fullSize();
+    return [this.taken.naturalWidth / width, this.taken.naturalHeight / height];
+  }
+
+  /** Marks the chosen end at a pixel of the shown image, or removes its mark. */
+  setEnd(pixel) {
+    if (!this.taken) return;
+    const [kx, ky] = this.fromFull();
+    const [width, height] = this.fullSize();
+    const within = (v, size) => Math.min(Math.max(v, -0.5), size - 0.5);
+    const full = pixel && [within((pixel[0] + 0.5) / kx - 0.5, width), within((pixel[1] + 0.5) / ky - 0.5, height)];
+    this.ends.set(this.number, this.end, full);
+    this.chooseEnd(this.end);
+    this.draw();
+  }
+
+  /** Takes hold of a mark, or sets the chosen one; after the first of two the other is chosen. */
+  endDown(event) {
+    const pixel = this.pane.pixel(event);
+    const k = this.pane.part[2] / this.pane.canvas.getBoundingClientRect().width;
+    const far = (mark) => (mark ? Math.hypot(mark[0] - pixel[0], mark[1] - pixel[1]) / k : Infinity);
+    const distances = this.marks().map(far);
+    const nearest = distances[1] < distances[0] ? 1 : 0;
+    if (distances[nearest] < REACH) {
+      const mark = this.marks()[nearest];
+      this.chooseEnd(nearest);
+      // It moves with the pointer and does not jump to it.
+      this.held = [mark[0] - pixel[0], mark[1] - pixel[1]];
+      return;
+    }
+    const other = 1 - this.end;
+    if (this.ends.of(this.number)[this.end] && !this.ends.of(this.number)[other]) this.chooseEnd(other);
+    this.setEnd(pixel);
+    this.held = [0, 0];
+  }
+
+  endKey(event, step) {
+    const mark = this.marks()[this.end];
+    if (!mark) return;
+    if (event.key === "Delete" || event.key === "Backspace") this.setEnd(null);
+    else if (step) this.setEnd([mark[0] + step[0] * this.fromFull()[0], mark[1] + step[1] * this.fromFull()[1]]);
+    else return;
+    event.preventDefault();
+  }
+
+  /** Shows a larger or a smaller part of the photograph; `at` stays where it is on the screen. */
+  zoom(factor, at = this.marks()[this.end]) {
+    if (!this.taken) return;
+    const { naturalWidth: width, naturalHeight: height } = this.taken;
+    const [x, y, w, h] = this.pane.part;
+    const wide = Math.min(Math.max(w * factor, CLOSEST), width);
+    const k = wide / w;
+    const centre = at || [x + w / 2, y + h / 2];
+    const start = (low, c, size, whole) => Math.min(Math.max(c - (c - low) * k, 0), whole - size);
+    const high = Math.min(h * k, height);
+    this.pane.show(this.taken, [start(x, centre[0], wide, width), start(y, centre[1], high, height), wide, high], Infinity);
+    this.draw();
   }
 
   listenForMask() {
@@ -354,8 +494,10 @@ export class Editor {
     event.preventDefault();
     this.pane.canvas.focus();
     if (this.tool === "points") return this.markThis(event);
+    if (this.tool === "ends" && (!this.taken || event.button)) return undefined;
     this.pane.canvas.setPointerCapture(event.pointerId);
     this.pointers.set(event.pointerId, [event.clientX, event.clientY]);
+    if (this.tool === "ends") this.endDown(event);
     if (this.tool === "mask") {
       this.keepStroke();
       this.stroke(event, this.pane.pixel(event));
@@ -367,7 +509,10 @@ export class Editor {
     const before = this.pointers.get(event.pointerId);
     if (!before) return;
     const now = [event.clientX, event.clientY];
-    if (this.tool === "mask") {
+    if (this.tool === "ends") {
+      if (!this.held) return;
+      this.setEnd(this.pane.pixel(event).map((v, k) => v + this.held[k]));
+    } else if (this.tool === "mask") {
       this.stroke(event, this.pane.pixel({ clientX: before[0], clientY: before[1] }));
     } else if (this.pointers.size === 2) {
       const other = [...this.pointers].find(([id]) => id !== event.pointerId)[1];
@@ -410,7 +555,7 @@ export class Editor {
     this.draw();
   }
 
-  /** A point of the mesh, or of the board beside it. */
+  /** A point of the mesh, or of the board or the ground beside it. */
   markOther(event) {
     event.preventDefault();
     const pixel = this.other.pixel(event);
@@ -426,7 +571,8 @@ export class Editor {
       const hit = this.shape.hit(origin, there.map((v, k) => v - origin[k]));
       point = hit && apply(this.boardFromObject, hit);
     }
-    if (!point && direction[2] < 0) point = eye.map((v, k) => v - (eye[2] / direction[2]) * direction[k]);
+    const height = eye[2] - (this.teaching.floor || 0);
+    if (!point && direction[2] < 0) point = eye.map((v, k) => v - (height / direction[2]) * direction[k]);
     if (point) this.point = { point, seen: pixel };
     this.draw();
   }
@@ -474,7 +620,7 @@ export class Editor {
   async again(teaching, said) {
     const tool = this.tool === "points" ? "pose" : this.tool;
     await this.open(teaching, this.number, this.shape);
-    if (tool !== this.tool && !byId(`tab-${tool}`).disabled) this.tab(tool);
+    if (tool !== this.tool && !byId(`tab-${tool}`).disabled) await this.tab(tool);
     if (said) byId("editor-status").replaceChildren(element("span", { className: "good" }, [`${said} Close and continue to make what depends on it again.`]));
   }
 

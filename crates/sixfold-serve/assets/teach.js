@@ -1,7 +1,8 @@
-// The page Teach: photographs on the board in, a stored object out, with every step to be inspected and corrected.
+// The page Teach: photographs in, on the printed board or without one, a stored object out, with every step to be inspected and corrected.
 
 import { ask, byId, element, follow, json, Problem, showProblem } from "/static/api.js";
 import { Editor, shapeOf } from "/static/editor.js";
+import { Ends } from "/static/ends.js";
 import { dropZone, jobParts, kindOf, showState } from "/static/form.js";
 
 /** Faces of the mesh as it is dragged, and as it is shown. */
@@ -10,8 +11,12 @@ const SHOWN_FACES = 20000;
 /** Photographs of one request. */
 const MOST_AT_ONCE = 60;
 
-const chosen = { rgb: new Map(), depth: new Map(), camera: new Map() };
-const NAMES = { rgb: ["photograph", "photographs"], depth: ["depth image", "depth images"], camera: ["camera file", "camera files"] };
+const MESHES = /\.(ply|obj|stl|gltf|glb|xyz)$/i;
+
+const chosen = { rgb: new Map(), depth: new Map(), camera: new Map(), mesh: new Map() };
+const NAMES = {
+  rgb: ["photograph", "photographs"], depth: ["depth image", "depth images"], camera: ["camera file", "camera files"], mesh: ["mesh", "meshes"],
+};
 const STATES = {
   ready: "to be continued", queued: "waiting", running: "working", failed: "stopped", taught: "to be inspected", accepted: "stored",
 };
@@ -20,7 +25,8 @@ let shown = null;
 let viewer = null;
 let viewed = "";
 
-const editor = new Editor((teaching) => show(teaching));
+const ends = new Ends(() => showScale());
+const editor = new Editor((teaching) => show(teaching), ends);
 
 function showChosen() {
   const rows = Object.entries(chosen).filter(([, files]) => files.size).map(([kind, files]) => {
@@ -33,23 +39,67 @@ function showChosen() {
     return element("li", {}, [element("span", { className: "name", title: [...files.keys()].join(", ") }, [text]), remove]);
   });
   byId("files").replaceChildren(...rows);
+  byId("mesh-row").hidden = !chosen.mesh.size;
+  byId("mesh-name").textContent = [...chosen.mesh.keys()].join();
   showActions();
 }
 
-dropZone(async (files) => {
+async function choose(files) {
   for (const file of files) {
-    const kind = await kindOf(file);
+    const kind = MESHES.test(file.name) ? "mesh" : await kindOf(file);
     const place = chosen[kind === "mask" ? "rgb" : kind];
-    if (kind === "camera") place.clear();
+    // One of each of these.
+    if (kind === "camera" || kind === "mesh") place.clear();
     place.set(file.name, file);
   }
   showChosen();
+}
+
+dropZone(choose);
+byId("mesh-file").addEventListener("change", async () => {
+  const files = [...byId("mesh-file").files];
+  byId("mesh-file").value = "";
+  await choose(files);
 });
 
 const input = (name) => document.forms[0].elements[name];
+const withoutBoard = () => input("without_board").value === "true";
 
-/** The chosen files in requests that the server takes, photographs with their depth. */
-async function batches() {
+function showBoard() {
+  byId("without-board-hint").hidden = !withoutBoard();
+  byId("ruler-row").hidden = withoutBoard();
+}
+
+byId("form").addEventListener("change", () => {
+  showBoard();
+  showActions();
+});
+
+const rulerText = (teaching) => (teaching.ruler === null ? "" : String(Number(teaching.ruler.toFixed(3))));
+
+/** The settings of the form, of which the shown teaching has others, as fields of a request. */
+function settings(teaching) {
+  const now = { without_board: String(withoutBoard()), hull_only: String(input("hull_only").checked) };
+  const ruler = input("ruler").value.trim();
+  if (ruler && !withoutBoard()) now.ruler = ruler;
+  if (input("remove_mesh").checked) now.remove_mesh = "true";
+  if (!teaching) return now;
+  const before = { ...teaching, ruler: rulerText(teaching), remove_mesh: false };
+  return Object.fromEntries(Object.entries(now).filter(([name, value]) => value !== String(before[name])));
+}
+
+/** Shows a teaching's settings in the form. */
+function takeSettings(teaching) {
+  input("without_board").value = String(teaching.without_board);
+  input("hull_only").checked = teaching.hull_only;
+  input("remove_mesh").checked = false;
+  byId("remove-mesh-row").hidden = !teaching.given_mesh;
+  input("ruler").value = rulerText(teaching);
+  showBoard();
+}
+
+/** The chosen files in requests that the server takes, photographs with their depth, and the settings that a teaching does not have. */
+async function batches(teaching = null) {
   const { max_upload: most } = await json("/v1/health");
   const sorted = (files) => [...files.values()].sort((a, b) => (a.name < b.name ? -1 : 1));
   const [photographs, depth] = [sorted(chosen.rgb), sorted(chosen.depth)];
@@ -70,12 +120,13 @@ async function batches() {
     if (depth[i]) form.append("depth", depth[i], depth[i].name);
     [bytes, count] = [bytes + size, count + 1];
   });
-  for (const file of chosen.camera.values()) all[0].append("camera", file, file.name);
+  for (const kind of ["camera", "mesh"]) for (const file of chosen[kind].values()) all[0].append(kind, file, file.name);
+  if (chosen.mesh.size) all[0].append("unit", input("unit").value);
   for (const form of all) {
     const scale = input("depth_scale").value.trim() || "1";
     if (depth.length) form.append("depth_scale", scale);
   }
-  if (input("ruler").value.trim()) all[0].append("ruler", input("ruler").value.trim());
+  for (const [name, value] of Object.entries(settings(teaching))) all[0].append(name, value);
   return all;
 }
 
@@ -93,12 +144,13 @@ byId("form").addEventListener("submit", async (event) => {
   try {
     const [first, ...more] = await batches();
     first.append("name", input("name").value.trim());
-    for (const name of ["hull_only", "replace"]) if (input(name).checked) first.append(name, "true");
+    first.delete("remove_mesh");
+    if (input("replace").checked) first.append("replace", "true");
     first.append("start", "false");
     const teaching = await json("/v1/teachings", { method: "POST", body: first });
     history.pushState(null, "", `?id=${teaching.id}`);
     await sendMore(teaching, more);
-    await run(teaching);
+    await runWithScale(await json(teaching.links.teaching));
   } catch (problem) {
     showProblem(parts.status, problem);
   } finally {
@@ -110,6 +162,42 @@ byId("form").addEventListener("submit", async (event) => {
 /** Starts a job of a teaching and follows it. */
 async function run(teaching) {
   await started(teaching, await json(teaching.links.run, { method: "POST" }));
+}
+
+/** Whether a run can start: without a board the scale must be known. */
+const hasScale = (teaching) =>
+  !teaching.without_board || teaching.length !== null || teaching.photographs.some((p) => p.has_depth);
+
+/** Runs a teaching, or shows it with what is missing. */
+async function runWithScale(teaching) {
+  if (hasScale(teaching)) {
+    await run(teaching);
+    return;
+  }
+  show(teaching);
+  parts.status.replaceChildren("The photographs are stored. Mark the two ends of a measured length, then begin.");
+}
+
+const lengthText = (teaching) => (teaching.length === null ? "" : String(Number((1000 * teaching.length).toFixed(3))));
+
+/** Whether length or ends are not on the server yet. */
+const scaleIsNew = () => shown.without_board && (!ends.saved || byId("length").value.trim() !== lengthText(shown));
+
+/** Sends length and ends. */
+async function saveScale(teaching) {
+  const form = new FormData();
+  const text = byId("length").value.trim().replace(",", ".");
+  const length = Number(text);
+  if (text && !(length >= 5 && length <= 5000)) {
+    throw new Problem({ error: `The length is "${text}".`, advice: "Give a number of millimetres, 5 to 5000." }, 0);
+  }
+  if (text) form.append("length", String(length / 1000));
+  if (ends.list().length || !text) form.append("ends", JSON.stringify(ends.list()));
+  const after = await json(teaching.links.photographs, { method: "POST", body: form });
+  ends.keep();
+  byId("length").value = lengthText(after);
+  show(after);
+  return after;
 }
 
 /** Follows a job; what is known is shown again with each of its steps. */
@@ -145,16 +233,28 @@ function on(id, work) {
       showProblem(parts.status, problem);
     } finally {
       byId(id).disabled = false;
+      showScale();
       listEarlier();
     }
   });
 }
 
-on("run", run);
+on("run", async (teaching) => run(scaleIsNew() ? await saveScale(teaching) : teaching));
 on("more", async (teaching) => {
-  await sendMore(teaching, await batches());
-  await run(teaching);
+  await sendMore(teaching, await batches(teaching));
+  const after = await json(teaching.links.teaching);
+  takeSettings(after);
+  await runWithScale(after);
 });
+on("scale-save", async (teaching) => {
+  await saveScale(teaching);
+  parts.status.replaceChildren(element("span", { className: "good" }, ["Length and ends are saved."]));
+});
+on("mark", async (teaching) => {
+  const marked = ends.list().map((points) => points.photograph);
+  await edit(marked.length ? marked[0] : 0, "ends");
+});
+byId("length").addEventListener("input", () => showScale());
 on("accept", async (teaching) => {
   const job = await json(teaching.links.accept, { method: "POST" });
   await started(teaching, job);
@@ -181,7 +281,11 @@ function symmetryText(symmetries) {
 function facts(teaching) {
   const used = teaching.photographs.filter((p) => !p.state.startsWith("left_out")).length;
   const pairs = [["Photographs", `${used} used of ${teaching.photographs.length}`]];
-  if (teaching.rms !== null) pairs.push(["Tags", `${teaching.rms.toFixed(2)} pixels from where the board has them`]);
+  if (teaching.rms !== null) {
+    const text = teaching.without_board ? ["Features", "from where the poses put them"] : ["Tags", "from where the board has them"];
+    pairs.push([text[0], `${teaching.rms.toFixed(2)} pixels ${text[1]}`]);
+  }
+  if (teaching.given_mesh) pairs.push(["Given mesh", "aligned with the photographs"]);
   const { mesh } = teaching;
   if (mesh) {
     const size = mesh.size.map(millimetres).join(" x ");
@@ -193,42 +297,82 @@ function facts(teaching) {
   return pairs.flatMap(([term, text]) => [element("dt", {}, [term]), element("dd", {}, [text])]);
 }
 
-function tile(teaching, photograph) {
+/** What is shown below a photograph; `text` is why it is left out. */
+function captionOf(teaching, photograph) {
   const text = photograph.state.startsWith("left_out") ? photograph.reason || "left out" : "";
   const byPerson = ["pose", "mask"].filter((what) => photograph[`${what}_by`] === "person");
-  const caption = text ? `left out: ${text}` : byPerson.length ? `${byPerson.join(" and ")} corrected` : "";
+  const marked = teaching.without_board ? [0, 1].filter((end) => ends.of(photograph.number)[end]).map((end) => end + 1) : [];
+  const notes = [
+    byPerson.length ? `${byPerson.join(" and ")} corrected` : "",
+    marked.length ? `${marked.length > 1 ? "ends" : "end"} ${marked.join(" and ")} marked` : "",
+  ];
+  const caption = text ? `left out: ${text}` : notes.filter(Boolean).join("; ");
+  return { caption, text };
+}
+
+function tile(teaching, photograph) {
+  const { caption, text } = captionOf(teaching, photograph);
+  // Before the object is found the whole photograph is shown.
+  const part = photograph.links.mask || teaching.mesh ? "side=220&close_up=true" : "side=320";
   const made = element("button", { type: "button", className: "tile" }, [
-    element("img", { src: `${photograph.links.overlay}&side=220&close_up=true`, alt: "", loading: "lazy" }),
+    element("img", { src: `${photograph.links.overlay}&${part}`, alt: "", loading: "lazy" }),
     element("span", { className: "name" }, [photograph.name]),
     element("span", { className: text ? "reason" : "muted small" }, [caption]),
   ]);
   made.dataset.number = photograph.number;
   made.classList.toggle("out", Boolean(text));
-  made.addEventListener("click", async () => {
-    try {
-      await editor.open(shown, photograph.number, await shapeOf(shown, DRAGGED_FACES));
-    } catch (problem) {
-      showProblem(byId("editor-status"), problem);
-    }
-  });
+  made.addEventListener("click", () => edit(photograph.number));
   return made;
+}
+
+async function edit(number, tool) {
+  try {
+    await editor.open(shown, number, await shapeOf(shown, DRAGGED_FACES), tool);
+  } catch (problem) {
+    showProblem(byId("editor-status"), problem);
+  }
+}
+
+/** The measured length, and in how many photographs its ends are marked. */
+function showScale() {
+  byId("scale").hidden = !shown.without_board || ["queued", "running"].includes(shown.state);
+  const [first, second] = ends.counts();
+  const photographs = (count) => `${count} photograph${count === 1 ? "" : "s"}`;
+  const lacks = Math.min(first, second) < 2 ? " Each end has to be marked in two or more." : "";
+  byId("marked").textContent = `End 1 is marked in ${photographs(first)}, end 2 in ${photographs(second)}.${lacks}`;
+  byId("scale-save").disabled = !scaleIsNew();
+  for (const place of byId("tiles").children) {
+    const photograph = shown.photographs[Number(place.dataset.number)];
+    const { caption, text } = captionOf(shown, photograph);
+    if (!text) place.lastElementChild.textContent = caption;
+  }
+  showActions();
 }
 
 function showActions() {
   if (!shown) return;
   const busy = ["queued", "running"].includes(shown.state);
-  const photographs = chosen.rgb.size + chosen.camera.size > 0;
+  const files = chosen.rgb.size + chosen.camera.size + chosen.mesh.size > 0;
+  const changed = Object.keys(settings(shown)).length > 0;
   byId("actions").hidden = busy;
   byId("accept").hidden = shown.state !== "taught";
-  byId("run").hidden = !["ready", "failed"].includes(shown.state);
-  byId("run").textContent = shown.mesh || shown.camera ? "Continue" : "Begin";
-  byId("more").hidden = busy || !photographs;
+  byId("run").hidden = !["ready", "failed"].includes(shown.state) && !scaleIsNew();
+  byId("run").disabled = !hasScale(shown) && !scaleIsNew();
+  byId("run").textContent = shown.mesh || shown.rms !== null ? "Continue" : "Begin";
+  byId("more").hidden = busy || !(files || changed);
+  byId("more").textContent = files ? "Add the chosen files" : "Apply the settings";
   byId("find-link").hidden = !shown.object;
   byId("find-link").href = `/find?object=${encodeURIComponent(shown.object || "")}`;
 }
 
 function show(teaching) {
+  const another = !shown || shown.id !== teaching.id;
   shown = teaching;
+  ends.show(teaching);
+  if (another) {
+    byId("length").value = lengthText(teaching);
+    takeSettings(teaching);
+  }
   byId("hint").hidden = true;
   byId("teaching").hidden = false;
   byId("name").textContent = teaching.name;
@@ -237,7 +381,8 @@ function show(teaching) {
   byId("facts").replaceChildren(...facts(teaching));
   byId("legend").hidden = !teaching.mesh;
   byId("tiles").replaceChildren(...teaching.photographs.map((photograph) => tile(teaching, photograph)));
-  showActions();
+  byId("remove-mesh-row").hidden = !teaching.given_mesh;
+  showScale();
   view(teaching);
 }
 

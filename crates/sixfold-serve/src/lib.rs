@@ -16,6 +16,7 @@ mod form;
 mod health;
 mod images;
 mod jobs;
+mod meshes;
 mod methods;
 mod objects;
 mod openapi;

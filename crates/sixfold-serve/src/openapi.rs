@@ -73,7 +73,7 @@ struct Description;
         teachings::set_left_out,
         teachings::forget_corrections,
     ),
-    tags((name = "teachings", description = "Objects learned from photographs on the printed board"))
+    tags((name = "teachings", description = "Objects learned from photographs, on the printed board or without one"))
 )]
 struct WithNetworks;
 

@@ -48,6 +48,7 @@ const ASSETS: &[(&str, &str, &[u8])] = assets! {
     "/static/grasp.js", SCRIPT, "grasp.js";
     "/static/teach.js", SCRIPT, "teach.js";
     "/static/editor.js", SCRIPT, "editor.js";
+    "/static/ends.js", SCRIPT, "ends.js";
     "/static/pose.js", SCRIPT, "pose.js";
     "/static/viewer.js", SCRIPT, "viewer.js";
     "/static/vendor/three.min.js", SCRIPT, "vendor/three.min.js";

@@ -138,6 +138,25 @@ def check_teach(address, photographs):
     print(f"an object taught from {len(files) - 2} photographs is found {distance:.1f} mm from where it stands")
 
 
+def check_scale(address, photographs):
+    """Photographs without a board are accepted before their scale is known; a run is not."""
+    files = [("photographs", path) for path in sorted((photographs / "photographs").iterdir())[:3]]
+    settings = {"name": "bare", "without_board": "true"}
+    status, body = post(f"{address}/v1/teachings", settings, files)
+    assert status == 422 and json.loads(body)["field"] == "length", (status, body)
+    status, body = post(f"{address}/v1/teachings", settings | {"start": "false"}, files)
+    assert status == 201, (status, body)
+    link = json.loads(body)["links"]["teaching"]
+    status, body = request(f"{address}{link}/run", b"")
+    assert status == 409 and json.loads(body)["field"] == "length", (status, body)
+    ends = [{"photograph": files[i][1].name, "points": [[100, 200], [300, 210.5]]} for i in (0, 2)]
+    status, body = post(f"{address}{link}/photographs", {"length": 0.12, "ends": json.dumps(ends)}, [])
+    teaching = json.loads(body)
+    assert status == 200 and teaching["length"] == 0.12, (status, body)
+    assert [end["photograph"] for end in teaching["ends"]] == [0, 2], teaching["ends"]
+    assert request(f"{address}{link}", method="DELETE")[0] == 204
+
+
 def main():
     program, demo, photographs = sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3])
     with tempfile.TemporaryDirectory() as folder:
@@ -146,6 +165,7 @@ def main():
             try:
                 address = re.match(r"http://[\d.:]+", server.stdout.readline()).group()
                 check_description(address)
+                check_scale(address, photographs)
                 check_find(address, demo)
                 check_teach(address, photographs)
             finally:

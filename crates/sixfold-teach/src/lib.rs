@@ -49,6 +49,8 @@ pub use shape::{
 };
 pub use silhouette::{SalientSegmenter, Segmenter};
 pub use snapshot::Snapshot;
-pub use teaching::{By, MAX_PHOTOGRAPHS, Photograph, ShapeFacts, TeachOptions, Teaching, World};
+pub use teaching::{
+    By, MAX_PHOTOGRAPHS, Photograph, ShapeFacts, TeachOptions, Teaching, World, photograph_name,
+};
 pub use unboarded::{DepthOf, KnownLength, PutTogether, SeenFeatures, features_of, put_together};
 pub use view::{PosedPhotograph, Volume};

@@ -282,12 +282,23 @@ impl Snapshot {
         TeachOptions { ruler: self.state.ruler, camera: self.state.given_camera, world: self.state.world }
     }
 
+    /// The given length between two marked points, for photographs without a board.
+    pub fn length(&self) -> Option<&KnownLength> {
+        self.state.length.as_ref()
+    }
+
+    /// Whether a mesh was given, to be aligned with the photographs.
+    pub fn has_given_mesh(&self) -> bool {
+        self.state.given_mesh.is_some()
+    }
+
     /// A number that differs after each change.
     pub fn revision(&self) -> u64 {
         self.state.revision
     }
 
-    /// Root mean square distance of the detected tag corners to the projected corners of the board, pixels; once poses are found.
+    /// Root mean square distance of the detected tag corners, without a board of the features, to their projections, pixels; once poses
+    /// are found.
     pub fn rms(&self) -> Option<f64> {
         self.state.located.as_ref().map(|(_, _, rms)| *rms)
     }
@@ -301,6 +312,16 @@ impl Snapshot {
         let image = read_rgb(&self.photograph_file(number)?)?;
         let lens = self.camera().filter(|c| (c.width, c.height) == image.size());
         Ok(crate::reduce::undistorted(&image, lens, side))
+    }
+
+    /// A photograph with its lens distortion, at most `side` pixels wide and high: a point has the pixel of
+    /// [`KnownLength::ends`] in it, scaled.
+    ///
+    /// # Errors
+    /// [`TeachError::NoPhotograph`], [`TeachError::Image`].
+    pub fn image_as_taken(&self, number: usize, side: usize) -> Result<RgbImage, TeachError> {
+        let image = read_rgb(&self.photograph_file(number)?)?;
+        Ok(crate::reduce::undistorted(&image, None, side).0)
     }
 
     /// The image of [`Snapshot::image`], with the border of the mask and the outline of the mesh that was made last.

@@ -78,6 +78,11 @@ pub struct Photograph {
     pub left_out_by_person: bool,
 }
 
+/// The name under which a photograph is kept: at most 200 characters, without control characters.
+pub fn photograph_name(given: &str) -> String {
+    given.chars().filter(|c| !c.is_control()).take(200).collect()
+}
+
 impl Photograph {
     pub(crate) fn pose(&self) -> Option<Pose> {
         let rows = self.camera_from_board?;
@@ -189,17 +194,39 @@ impl Teaching {
         };
         let mut teaching = Teaching { known, _lock: lock };
         let given = options.ruler.is_some() || options.camera.is_some() || options.world != World::default();
-        let same = teaching.known.state.ruler == options.ruler
-            && teaching.known.state.world == options.world
-            && is_same(&teaching.known.state.given_camera, &options.camera);
-        if given && !same {
-            teaching.known.state.ruler = options.ruler;
-            teaching.known.state.given_camera = options.camera;
-            teaching.known.state.world = options.world;
-            teaching.forget_from(Step::Poses);
+        if given {
+            teaching.take_options(options);
         }
         teaching.save()?;
         Ok(teaching)
+    }
+
+    /// Changes the options. If they differ from the present ones, all steps are repeated; poses that a person gave are kept only
+    /// if they are still relative to the same frame.
+    ///
+    /// # Errors
+    /// [`TeachError::Io`].
+    pub fn set_options(&mut self, options: &TeachOptions) -> Result<(), TeachError> {
+        if self.take_options(options) { self.save() } else { Ok(()) }
+    }
+
+    /// Returns whether anything changed.
+    fn take_options(&mut self, options: &TeachOptions) -> bool {
+        let state = &mut self.known.state;
+        let same = state.ruler == options.ruler
+            && state.world == options.world
+            && is_same(&state.given_camera, &options.camera);
+        if same {
+            return false;
+        }
+        if state.world != options.world {
+            for photograph in &mut state.photographs {
+                photograph.pose_by = photograph.pose_by.map(|_| By::Program);
+            }
+        }
+        (state.ruler, state.given_camera, state.world) = (options.ruler, options.camera, options.world);
+        self.forget_from(Step::Poses);
+        true
     }
 
     pub(crate) fn save(&mut self) -> Result<(), TeachError> {
@@ -216,7 +243,7 @@ impl Teaching {
     /// # Errors
     /// [`TeachError::Image`] for bytes that are not an image, [`TeachError::Io`].
     pub fn add_photograph(&mut self, name: &str, bytes: &[u8]) -> Result<usize, TeachError> {
-        let name: String = name.chars().filter(|c| !c.is_control()).take(200).collect();
+        let name = photograph_name(name);
         // Refuse invalid images before anything is stored.
         let size = ImageFile::of_bytes(Path::new(&name), bytes).rgb()?.size();
         let png = bytes.starts_with(b"\x89PNG");
@@ -248,7 +275,13 @@ impl Teaching {
             left_out_by_person: false,
         };
         match there {
-            Some(number) => self.known.state.photographs[number] = photograph,
+            Some(number) => {
+                self.known.state.photographs[number] = photograph;
+                // Points that were marked in the former one.
+                if let Some(length) = &mut self.known.state.length {
+                    length.ends.retain(|(i, _)| *i != number);
+                }
+            }
             None => self.known.state.photographs.push(photograph),
         }
         self.forget_from(Step::Poses);
@@ -486,6 +519,15 @@ impl Teaching {
                 .map_err(|e| TeachError::File { path, what: e.to_string() })?;
         }
         self.known.state.given_mesh = hash;
+        self.forget_from(Step::Mesh);
+        self.save()
+    }
+
+    /// Discards the mesh: [`Teaching::reconstruct`] makes it again, perhaps with other options.
+    ///
+    /// # Errors
+    /// [`TeachError::Io`].
+    pub fn forget_mesh(&mut self) -> Result<(), TeachError> {
         self.forget_from(Step::Mesh);
         self.save()
     }

@@ -110,6 +110,36 @@ pub struct KnownLength {
     pub ends: Vec<(usize, [Option<[f64; 2]>; 2])>,
 }
 
+impl KnownLength {
+    /// Checks that the points lie within the photographs, which are given by name, width and height, and that two or more of them
+    /// show each point.
+    ///
+    /// # Errors
+    /// [`TeachError::Ends`]; [`TeachError::NoPhotograph`].
+    pub fn check(&self, photographs: &[(&str, (usize, usize))]) -> Result<(), TeachError> {
+        for (i, ends) in &self.ends {
+            let Some((name, size)) = photographs.get(*i) else {
+                return Err(TeachError::NoPhotograph { index: *i, photographs: photographs.len() });
+            };
+            let (w, h) = (size.0 as f64, size.1 as f64);
+            let inside = |[x, y]: &[f64; 2]| (-0.5..=w - 0.5).contains(x) && (-0.5..=h - 0.5).contains(y);
+            if let Some([x, y]) = ends.iter().flatten().find(|p| !inside(p)) {
+                let what = format!("{name}: found {x:.0},{y:.0}, the photograph has {w}x{h} pixels");
+                return Err(TeachError::Ends { what });
+            }
+        }
+        for end in 0..2 {
+            let found = self.ends.iter().filter(|(_, ends)| ends[end].is_some()).count();
+            if found < 2 {
+                let what =
+                    format!("the {} point is marked in {found} photographs, expected at least 2", WHICH[end]);
+                return Err(TeachError::Ends { what });
+            }
+        }
+        Ok(())
+    }
+}
+
 /// Registered photographs, in metres: z up; the origin is below the point at which the cameras look.
 #[derive(Debug, Clone)]
 pub struct PutTogether {
@@ -248,26 +278,8 @@ fn named(error: SfmError, seen: &[SeenFeatures], size: (usize, usize)) -> TeachE
 }
 
 fn check_ends(seen: &[SeenFeatures], length: &KnownLength) -> Result<(), TeachError> {
-    for (i, ends) in &length.ends {
-        let Some(s) = seen.get(*i) else {
-            return Err(TeachError::NoPhotograph { index: *i, photographs: seen.len() });
-        };
-        let (w, h) = (s.size.0 as f64, s.size.1 as f64);
-        let inside = |[x, y]: &[f64; 2]| (-0.5..=w - 0.5).contains(x) && (-0.5..=h - 0.5).contains(y);
-        if let Some([x, y]) = ends.iter().flatten().find(|p| !inside(p)) {
-            let what = format!("{}: found {x:.0},{y:.0}, the photograph has {w}x{h} pixels", s.name);
-            return Err(TeachError::Ends { what });
-        }
-    }
-    for end in 0..2 {
-        let found = length.ends.iter().filter(|(_, ends)| ends[end].is_some()).count();
-        if found < 2 {
-            let what =
-                format!("the {} point is marked in {found} photographs, expected at least 2", WHICH[end]);
-            return Err(TeachError::Ends { what });
-        }
-    }
-    Ok(())
+    let photographs: Vec<(&str, (usize, usize))> = seen.iter().map(|s| (s.name.as_str(), s.size)).collect();
+    length.check(&photographs)
 }
 
 fn check_depth(count: usize, depth: DepthOf<'_>) -> Result<(), TeachError> {

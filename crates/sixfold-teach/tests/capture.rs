@@ -8,8 +8,8 @@ use sixfold_geometry::{Camera, Image, KdTree, Mask, Pose, RgbImage, Vec3};
 use sixfold_mesh::Mesh;
 use sixfold_teach::simulation::{SimulatedCapture, SimulationOptions};
 use sixfold_teach::{
-    By, Capture, PosedPhotograph, SalientSegmenter, Segmenter, ShapeOptions, Snapshot, TeachError,
-    TeachOptions, Teaching, World, export_bop, photographs_of, reconstruct, segment,
+    By, Capture, KnownLength, PosedPhotograph, SalientSegmenter, Segmenter, ShapeOptions, Snapshot,
+    TeachError, TeachOptions, Teaching, World, export_bop, photographs_of, reconstruct, segment,
 };
 
 fn cuboid(low: [f64; 3], high: [f64; 3]) -> Mesh {
@@ -331,6 +331,39 @@ fn files_that_are_no_photographs_are_refused_before_anything_is_kept() {
     std::fs::write(dir.path().join("teaching.json"), "{\"version\": 9}").unwrap();
     let error = Teaching::open(dir.path(), &TeachOptions::default()).unwrap_err();
     assert!(error.to_string().contains("teaching.json"), "{error}");
+}
+
+#[test]
+fn changed_options_keep_only_what_belongs_to_them() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut teaching = Teaching::open(dir.path(), &TeachOptions::default()).unwrap();
+    for (i, file) in photographs().files[..2].iter().enumerate() {
+        teaching.add_photograph(&format!("p{i}.png"), file).unwrap();
+    }
+    let pose = Pose::from_translation(Vec3::new(0.0, 0.0, 0.5));
+    let set = |teaching: &mut Teaching, world, ruler| {
+        teaching.set_options(&TeachOptions { ruler, world, ..TeachOptions::default() }).unwrap();
+    };
+    teaching.set_pose(0, &pose).unwrap();
+    set(&mut teaching, World::Board, Some(0.1414));
+    assert_eq!(teaching.photographs()[0].pose_by, Some(By::Person), "the frame is the same");
+    set(&mut teaching, World::Features, Some(0.1414));
+    assert_eq!(teaching.camera_from_board(0), None, "a pose relative to the board");
+    let points = |x: f64| [Some([x, 20.0]), Some([x, 60.0])];
+    let length = KnownLength { metres: 0.2, ends: vec![(0, points(30.0)), (1, points(50.0))] };
+    let sizes: Vec<(&str, (usize, usize))> =
+        teaching.photographs().iter().map(|p| (p.name.as_str(), p.size.unwrap())).collect();
+    length.check(&sizes).unwrap();
+    let beyond = KnownLength { ends: vec![(0, points(30.0)), (1, points(5000.0))], ..length.clone() };
+    let error = beyond.check(&sizes).unwrap_err().to_string();
+    assert!(error.contains("p1.png: found 5000,20"), "{error}");
+    teaching.set_length(Some(length.clone())).unwrap();
+    teaching.add_photograph("p1.png", &photographs().files[1]).unwrap();
+    assert_eq!(teaching.length(), Some(&length), "the same photograph again");
+    teaching.add_photograph("p1.png", &photographs().files[2]).unwrap();
+    assert_eq!(teaching.length().unwrap().ends, [(0, points(30.0))]);
+    set(&mut teaching, World::Board, None);
+    assert_eq!((teaching.options().world, teaching.options().ruler), (World::Board, None));
 }
 
 #[test]

@@ -1,6 +1,5 @@
 //! Adding an object to the store from an uploaded mesh, as `sixfold object add` does.
 
-use std::collections::HashMap;
 use std::path::Path;
 
 use axum::extract::{Request as HttpRequest, State};
@@ -10,8 +9,8 @@ use sixfold_estimator::{NewObject, ObjectRecord, PoseEstimator, StoreError};
 use sixfold_geometry::Vec3;
 use sixfold_io::{limits, read_regular};
 use sixfold_mesh::{
-    ContinuousSymmetry, FoundSymmetry, Mesh, ModelInfo, SymmetryOptions, Unit, check_size, find_symmetries,
-    parse_gltf, parse_obj, parse_ply, parse_stl, parse_xyz, sure_symmetries,
+    ContinuousSymmetry, FoundSymmetry, Mesh, ModelInfo, SymmetryOptions, Unit, find_symmetries,
+    sure_symmetries,
 };
 use sixfold_ppf::PpfEstimator;
 
@@ -20,10 +19,8 @@ use crate::app::{App, Shared};
 use crate::error::{Answer, ApiError, Problem};
 use crate::form::{Form, FormRule, UploadedFile};
 use crate::jobs::{Accepted, JobView, Stopped, Work};
+use crate::meshes::{MeshFormat, mesh_resources, mesh_unit};
 use crate::objects::SymmetryView;
-
-/// Maximum number of additional files of a mesh: materials and textures.
-const MAX_RESOURCES: usize = 50;
 
 const RULE: FormRule = FormRule {
     files: &["mesh"],
@@ -37,7 +34,7 @@ pub(crate) struct ObjectRequest {
     name: String,
     /// The client's name of the mesh file; for messages and the record.
     file_name: String,
-    format: Format,
+    format: MeshFormat,
     unit: Unit,
     turns_about: Option<Axis>,
     /// The evidence by which symmetries are found and stored.
@@ -49,16 +46,6 @@ pub(crate) struct ObjectRequest {
     replace: bool,
     /// The client's names of the additional files; file `i` is `resource-i` in the job's folder.
     resources: Vec<String>,
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-enum Format {
-    Ply,
-    Obj,
-    Stl,
-    Gltf,
-    Xyz,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -135,10 +122,7 @@ impl ObjectRequest {
         let name = form.text("name")?.ok_or_else(|| {
             ApiError::field("name", "nothing", "up to 100 letters, digits, - and _", "give the object a name")
         })?;
-        let units = "one of m, cm, mm, in";
-        let unit = form.parsed::<Unit>("unit", units)?.ok_or_else(|| {
-            ApiError::field("unit", "nothing", units, "a mesh file does not say its unit: give it")
-        })?;
+        let unit = mesh_unit(form)?;
         let axes = [("x", Axis::X), ("y", Axis::Y), ("z", Axis::Z)];
         let turns_about = one_of(form, "turns_about", &axes, "x, y or z")?;
         let kinds = [("shape", Evidence::Shape), ("colors", Evidence::Colors)];
@@ -148,19 +132,11 @@ impl ObjectRequest {
             return Err(ApiError::field("find_symmetries", "it and turns_about", "one of them", advice));
         }
         let noise = form.number("noise", "millimetres, 0 to 100", |mm| (0.0..=100.0).contains(&mm))?;
-        let resources = form.files("resource");
-        if resources.len() > MAX_RESOURCES {
-            return Err(ApiError::field(
-                "resource",
-                format!("{} files", resources.len()),
-                format!("at most {MAX_RESOURCES}"),
-                "join the textures, or send a GLB file",
-            ));
-        }
+        let resources = mesh_resources(form)?;
         Ok(ObjectRequest {
             name: name.to_owned(),
             file_name: mesh.name.clone(),
-            format: Format::of(&mesh.name)?,
+            format: MeshFormat::of(&mesh.name)?,
             unit,
             turns_about,
             find_symmetries,
@@ -172,33 +148,7 @@ impl ObjectRequest {
 
     /// The mesh in metres. Files that it refers to are searched only among the uploaded files, by `resource`.
     fn mesh(&self, bytes: &[u8], resource: &dyn Fn(usize) -> std::io::Result<Vec<u8>>) -> Answer<Mesh> {
-        let parse = match self.format {
-            Format::Ply => parse_ply,
-            Format::Obj => parse_obj,
-            Format::Stl => parse_stl,
-            Format::Gltf => parse_gltf,
-            Format::Xyz => parse_xyz,
-        };
-        let numbers: HashMap<&str, usize> =
-            self.resources.iter().enumerate().map(|(i, name)| (name.as_str(), i)).collect();
-        let beside = |name: &str| match numbers.get(name) {
-            Some(&i) => resource(i),
-            None => Err(std::io::Error::new(
-                std::io::ErrorKind::NotFound,
-                "not among the uploaded files: send it as a field `resource`",
-            )),
-        };
-        let wrong = |e: &dyn std::fmt::Display| {
-            ApiError::about(
-                "mesh",
-                e,
-                "a mesh of an object of 5 mm to 5 m",
-                "repair or convert the file, and check its unit",
-            )
-        };
-        let mesh = parse(bytes, "mesh", self.unit, &beside).map_err(|e| wrong(&e))?;
-        check_size(&mesh, "mesh", self.unit).map_err(|e| wrong(&e))?;
-        Ok(mesh)
+        self.format.parse(bytes, self.unit, &self.resources, resource)
     }
 
     /// The mesh's data for the store, and all symmetries found in it.
@@ -245,28 +195,6 @@ pub(crate) fn check_new_name(app: &App, name: &str, replace: bool) -> Answer<()>
             Err(ApiError::of_store("name", &StoreError::Exists { name: name.to_owned(), folder }))
         }
         _ => Ok(()),
-    }
-}
-
-impl Format {
-    /// The format by the extension of a file's name.
-    fn of(name: &str) -> Answer<Format> {
-        let ending = name.rsplit_once('.').map(|(_, ending)| ending.to_ascii_lowercase());
-        Ok(match ending.as_deref() {
-            Some("ply") => Format::Ply,
-            Some("obj") => Format::Obj,
-            Some("stl") => Format::Stl,
-            Some("gltf" | "glb") => Format::Gltf,
-            Some("xyz") => Format::Xyz,
-            _ => {
-                return Err(ApiError::field(
-                    "mesh",
-                    format!("a file named {name:?}"),
-                    "a name that ends in .ply, .obj, .stl, .gltf, .glb or .xyz",
-                    "convert the mesh to one of them; the file's extension gives the format",
-                ));
-            }
-        })
     }
 }
 

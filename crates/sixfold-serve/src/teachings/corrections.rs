@@ -76,7 +76,7 @@ fn changed(
     let (entry, number) = (app.teachings.get(id)?, number(text)?);
     // Check that the photograph exists before anything is locked.
     entry.snapshot()?.photograph_file(number).map_err(|e| of_teach(&e))?;
-    entry.change(app, &Default::default(), |teaching| change(teaching, number))?;
+    entry.change(app, |teaching| change(teaching, number))?;
     Ok(Json(TeachingView::of(app, &entry)?))
 }
 

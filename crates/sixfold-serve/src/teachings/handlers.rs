@@ -5,10 +5,11 @@ use axum::body::Bytes;
 use axum::extract::{Path, Request as HttpRequest, State};
 use axum::http::StatusCode;
 use serde::{Deserialize, Serialize};
-use sixfold_teach::Teaching;
+use sixfold_teach::{Snapshot, TeachOptions, Teaching, World};
 use utoipa::ToSchema;
 
-use super::form::{Given, MORE, MoreForm, NEW, TeachingForm};
+use super::form::{Before, Given, MORE, MoreForm, NEW, TeachingForm};
+use super::scale::no_scale;
 use super::task::TeachRequest;
 use super::views::{TeachingItem, TeachingView};
 use super::{Entry, Record, VERSION, of_teach};
@@ -37,7 +38,7 @@ pub(crate) async fn list_teachings(State(app): Shared) -> Answer<Json<TeachingLi
     .await
 }
 
-/// Starts to teach an object from photographs of it on the printed board, and runs it unless `start` is false.
+/// Starts to teach an object from photographs of it, on the printed board or without one, and runs it unless `start` is false.
 #[utoipa::path(post, path = "/v1/teachings", tag = "teachings",
     request_body(content = TeachingForm, content_type = "multipart/form-data"),
     responses(
@@ -56,7 +57,7 @@ pub(crate) async fn add_teaching(
     let form = Form::read(&app, request, &NEW).await?;
     app.blocking(move |app| {
         let starts = form.parsed("start", "true or false")?.unwrap_or(true);
-        let entry = laid_down(app, &form)?;
+        let entry = laid_down(app, &form, starts)?;
         if starts {
             // If too many jobs wait, it can be run later: the photographs are kept.
             if let Err(error) = entry.start(app, TeachRequest::run(&entry.id)) {
@@ -68,19 +69,22 @@ pub(crate) async fn add_teaching(
     .await
 }
 
-fn laid_down(app: &App, form: &Form) -> Answer<std::sync::Arc<Entry>> {
+fn laid_down(app: &App, form: &Form, starts: bool) -> Answer<std::sync::Arc<Entry>> {
     let flag = |name: &str| Ok::<bool, ApiError>(form.parsed(name, "true or false")?.unwrap_or(false));
     let name = form.text("name")?.ok_or_else(|| {
         ApiError::field("name", "nothing", "up to 100 letters, digits, - and _", "give the object a name")
     })?;
-    let (hull_only, replace) = (flag("hull_only")?, flag("replace")?);
+    let replace = flag("replace")?;
     check_new_name(app, name, replace)?;
-    form.needed_file("photographs", "photographs of the object on the printed board")?;
-    let given = Given::of_form(form, None)?;
+    form.needed_file("photographs", "photographs of the object")?;
+    let given = Given::of_form(form, &Before::default())?;
+    if starts && !given.has_scale() {
+        return Err(no_scale());
+    }
     let record = Record {
         version: VERSION,
         name: name.to_owned(),
-        hull_only,
+        hull_only: given.hull_only().unwrap_or(false),
         replace,
         created: now(),
         job: None,
@@ -91,7 +95,7 @@ fn laid_down(app: &App, form: &Form) -> Answer<std::sync::Arc<Entry>> {
         accepted: false,
     };
     app.teachings.add(record, |folder| {
-        let mut teaching = Teaching::open(folder, &given.options).map_err(|e| of_teach(&e))?;
+        let mut teaching = Teaching::open(folder, &TeachOptions::default()).map_err(|e| of_teach(&e))?;
         given.into(&mut teaching)
     })
 }
@@ -116,7 +120,8 @@ pub(crate) async fn delete_teaching(State(app): Shared, Path(id): Path<String>) 
     Ok(StatusCode::NO_CONTENT)
 }
 
-/// Adds photographs, depth, the camera file or the ruler's length. Poses are found again.
+/// Adds photographs, depth or the camera file, or changes settings: ruler, with or without a board, length and ends, mesh, hull_only.
+/// What depends on them is computed again by the next run: poses, or the mesh alone.
 #[utoipa::path(post, path = "/v1/teachings/{id}/photographs", tag = "teachings",
     params(("id" = String, Path, description = "Its id")),
     request_body(content = MoreForm, content_type = "multipart/form-data"),
@@ -139,12 +144,12 @@ pub(crate) async fn add_photographs(
     app.blocking(move |app| {
         let entry = app.teachings.get(&id)?;
         let known = entry.snapshot()?;
-        let mut given = Given::of_form(&form, known.photographs().iter().find_map(|p| p.size))?;
+        let given = Given::of_form(&form, &Before::of(&known, entry.record().hull_only))?;
         if given.is_empty() {
             return Err(ApiError::field(
                 "photographs",
                 "nothing",
-                "photographs, a camera file or the ruler's length",
+                "photographs, a camera file, or settings",
                 "send what is to be added",
             ));
         }
@@ -158,11 +163,15 @@ pub(crate) async fn add_photographs(
                 "leave out those that show nothing new",
             ));
         }
-        let before = known.options();
-        given.options.ruler = given.options.ruler.or(before.ruler);
-        given.options.camera = given.options.camera.or(before.camera);
-        let options = given.options;
-        entry.change(app, &options, |teaching| given.into(teaching))?;
+        let hull_only = given.hull_only().filter(|new| *new != entry.record().hull_only);
+        entry.change(app, |teaching| {
+            given.into(teaching)?;
+            if let Some(hull_only) = hull_only {
+                teaching.forget_mesh().map_err(|e| of_teach(&e))?;
+                entry.note(|record| record.hull_only = hull_only)?;
+            }
+            Ok(())
+        })?;
         Ok(Json(TeachingView::of(app, &entry)?))
     })
     .await
@@ -172,15 +181,26 @@ pub(crate) async fn add_photographs(
 #[utoipa::path(post, path = "/v1/teachings/{id}/run", tag = "teachings", params(("id" = String, Path, description = "Its id")), responses(
     (status = 202, description = "The job waits for a worker", body = JobView),
     (status = 404, description = "There is no such teaching", body = Problem),
-    (status = 409, description = "A job for it is running or waiting", body = Problem),
+    (status = 409, description = "A job for it is running or waiting, or the scale of photographs without a board is not known \
+         yet", body = Problem),
     (status = 429, description = "Too many waiting jobs", body = Problem),
 ))]
 pub(crate) async fn run_teaching(State(app): Shared, Path(id): Path<String>) -> Answer<Accepted> {
     app.blocking(move |app| {
-        let job = app.teachings.get(&id)?.start(app, TeachRequest::run(&id))?;
+        let entry = app.teachings.get(&id)?;
+        if !has_scale(&entry.snapshot()?) {
+            return Err(no_scale().with_status(StatusCode::CONFLICT));
+        }
+        let job = entry.start(app, TeachRequest::run(&id))?;
         Ok(Accepted(JobView::of(app, &job)))
     })
     .await
+}
+
+/// Whether the scale of a teaching follows from what was given.
+fn has_scale(known: &Snapshot) -> bool {
+    let depth = || known.photographs().iter().any(|p| p.depth.is_some() && !p.left_out_by_person);
+    known.options().world != World::Features || known.length().is_some() || depth()
 }
 
 /// What to store an object as.

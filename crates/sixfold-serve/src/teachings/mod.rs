@@ -1,4 +1,4 @@
-//! Teachings: objects that are taught from photographs on the board, one folder each, with the functions of `sixfold teach`.
+//! Teachings: objects that are taught from photographs, on the board or without one, one folder each, with the functions of `sixfold teach`.
 //!
 //! `DATA/teachings/ID` holds `record.json` (the server's part) and the files of [`sixfold_teach::Teaching`]. Readers take a
 //! [`Snapshot`]; one job or one correction at a time changes the folder. A job that was stopped resumes at its last step.
@@ -7,6 +7,7 @@ mod corrections;
 mod form;
 mod handlers;
 mod photographs;
+mod scale;
 mod task;
 mod views;
 
@@ -112,14 +113,10 @@ impl Entry {
     }
 
     /// Changes the folder, unless a job waits or runs. The accepted object then no longer corresponds to the folder.
-    fn change<T>(
-        &self,
-        app: &App,
-        options: &TeachOptions,
-        change: impl FnOnce(&mut Teaching) -> Answer<T>,
-    ) -> Answer<T> {
+    fn change<T>(&self, app: &App, change: impl FnOnce(&mut Teaching) -> Answer<T>) -> Answer<T> {
         let _held = self.free(app)?;
-        let mut teaching = Teaching::open(&self.folder, options).map_err(|e| of_teach(&e))?;
+        let mut teaching =
+            Teaching::open(&self.folder, &TeachOptions::default()).map_err(|e| of_teach(&e))?;
         let changed = change(&mut teaching)?;
         self.note(|record| (record.accepted, record.problem) = (false, None))?;
         Ok(changed)
@@ -254,10 +251,25 @@ fn read_record(folder: &Path) -> Option<Record> {
     (record.version == VERSION).then_some(record)
 }
 
+/// The library's messages name the options of `sixfold teach`: here the fields of a request.
+fn in_fields(field: &str, error: &TeachError, expected: &str, advice: &str) -> ApiError {
+    const OPTIONS: [(&str, &str); 6] = [
+        ("--no-board", "without_board"),
+        ("--depth-scale", "depth_scale"),
+        ("--length", "length"),
+        ("--ends", "ends"),
+        ("--camera", "camera"),
+        ("--mesh", "mesh"),
+    ];
+    let text = OPTIONS.iter().fold(error.to_string(), |text, (option, field)| text.replace(option, field));
+    ApiError::about(field, text, expected, advice)
+}
+
 /// An error of the library as an answer to the client, without paths of this machine.
 pub(crate) fn of_teach(error: &TeachError) -> ApiError {
-    let photographs = |expected: &str, advice: &str| ApiError::about("photographs", error, expected, advice);
-    let sides = "photographs of one object on the printed board, from all sides";
+    let photographs = |expected: &str, advice: &str| in_fields("photographs", error, expected, advice);
+    let sides = "photographs of one object from all sides, on the printed board or with without_board=true";
+    let marks = "each end of the length marked in two or more photographs, from different sides";
     let last = |path: &Path| path.file_name().unwrap_or_default().to_string_lossy().into_owned();
     match error {
         TeachError::Image(error) => ApiError::of_image("photographs", error),
@@ -291,7 +303,29 @@ pub(crate) fn of_teach(error: &TeachError) -> ApiError {
         ),
         TeachError::NoBoard { .. } => photographs(
             sides,
-            "print `sixfold board`, lay the object on it and photograph both; the tags have to be sharp",
+            "print `sixfold board`, lay the object on it and photograph both; the tags have to be sharp. Or send without_board=true, \
+             where the surroundings have texture",
+        ),
+        TeachError::NoPhotographs => photographs(sides, "add photographs"),
+        TeachError::NotTogether { .. } | TeachError::Sfm(_) => photographs(
+            "photographs of one object on a ground with texture that stays in place, in steps of at most 20 degrees around it",
+            "add photographs between the others, or take them again on a newspaper or a patterned cloth",
+        ),
+        TeachError::NoScale => scale::no_scale(),
+        TeachError::FewDepths { .. } => in_fields(
+            "depth",
+            error,
+            "depth images from the viewpoints of the photographs",
+            "check depth_scale, or send length and ends",
+        ),
+        TeachError::Ends { .. } => {
+            in_fields("ends", error, marks, "correct the marks, or mark the ends in more photographs")
+        }
+        TeachError::MeshSize { .. } | TeachError::MeshDoesNotFit { .. } => in_fields(
+            "mesh",
+            error,
+            "a mesh of the photographed object, with its unit",
+            "send another mesh or unit, or remove_mesh=true to make one from the photographs",
         ),
         TeachError::OneSide { .. } => photographs(sides, "add photographs from the other sides"),
         TeachError::NoObject { .. }

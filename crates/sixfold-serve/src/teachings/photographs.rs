@@ -31,6 +31,8 @@ pub(crate) struct Detail {
     side: Option<usize>,
     /// For overlays: only the object and its surroundings, a square.
     close_up: Option<bool>,
+    /// For images: with lens distortion, as the photograph was taken; the points of `ends` are pixels of it.
+    as_taken: Option<bool>,
     /// The revision that links contain: browsers may cache such an image.
     revision: Option<u64>,
 }
@@ -55,20 +57,20 @@ async fn sent(
     (id, text): (String, String),
     asked: Asked,
     content_type: &'static str,
-    make: impl FnOnce(&Snapshot, usize, usize, bool) -> Answer<Vec<u8>> + Send + 'static,
+    make: impl FnOnce(&Snapshot, usize, usize, &Detail) -> Answer<Vec<u8>> + Send + 'static,
 ) -> Answer<Response> {
     app.blocking(move |app| {
         let known = app.teachings.get(&id)?.snapshot()?;
         let number = number(&text)?;
         let expected = format!("a whole number, {} to {}", SIDES.start(), SIDES.end());
         let wrong = |found: String| ApiError::field("side", found, &*expected, "correct the value");
-        let Detail { side, close_up, revision } = asked.map_err(|e| wrong(e.body_text()))?.0;
-        let side = side.unwrap_or(SIDE);
+        let detail = asked.map_err(|e| wrong(e.body_text()))?.0;
+        let side = detail.side.unwrap_or(SIDE);
         if !SIDES.contains(&side) {
             return Err(wrong(side.to_string()));
         }
-        let bytes = make(&known, number, side, close_up.unwrap_or(false))?;
-        Ok(kept_while(revision == Some(known.revision()), content_type, bytes))
+        let bytes = make(&known, number, side, &detail)?;
+        Ok(kept_while(detail.revision == Some(known.revision()), content_type, bytes))
     })
     .await
 }
@@ -91,7 +93,7 @@ fn jpeg(image: &RgbImage) -> Answer<Vec<u8>> {
     Ok(bytes.into_inner())
 }
 
-/// A photograph without lens distortion; with it as long as the camera is not known.
+/// A photograph without lens distortion; with it as long as the camera is not known, or if `as_taken`.
 #[utoipa::path(get, path = "/v1/teachings/{id}/photographs/{number}/image.jpg", tag = "teachings",
     params(("id" = String, Path, description = "The teaching's id"), ("number" = usize, Path, description = "From 0"), Detail),
     responses(
@@ -104,8 +106,12 @@ pub(crate) async fn photograph_image(
     Path(path): Path<(String, String)>,
     asked: Asked,
 ) -> Answer<Response> {
-    sent(app, path, asked, "image/jpeg", |known, number, side, _| {
-        jpeg(&known.image(number, side).map_err(|e| of_teach(&e))?.0)
+    sent(app, path, asked, "image/jpeg", |known, number, side, detail| {
+        let image = match detail.as_taken {
+            Some(true) => known.image_as_taken(number, side),
+            _ => known.image(number, side).map(|(image, _)| image),
+        };
+        jpeg(&image.map_err(|e| of_teach(&e))?)
     })
     .await
 }
@@ -123,7 +129,8 @@ pub(crate) async fn photograph_overlay(
     Path(path): Path<(String, String)>,
     asked: Asked,
 ) -> Answer<Response> {
-    sent(app, path, asked, "image/jpeg", |known, number, side, close_up| {
+    sent(app, path, asked, "image/jpeg", |known, number, side, detail| {
+        let close_up = detail.close_up.unwrap_or(false);
         let image = if close_up { known.close_up(number, side) } else { known.overlay(number, side) };
         jpeg(&image.map_err(|e| of_teach(&e))?)
     })

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use sixfold_auto::prepare_all;
 use sixfold_teach::{
-    FEWEST_PHOTOGRAPHS, FEWEST_WITH_DEPTH, ShapeOptions, TeachError, TeachOptions, Teaching,
+    FEWEST_PHOTOGRAPHS, FEWEST_WITH_DEPTH, ShapeOptions, TeachError, TeachOptions, Teaching, World,
 };
 
 use super::views::MeshFacts;
@@ -79,8 +79,11 @@ fn step(
     }
 }
 
-/// Reports too few photographs before anything is searched in them.
+/// Reports too few photographs on the board before anything is searched in them. Without a board the first step reports them.
 fn check_number(teaching: &Teaching) -> Result<(), TeachError> {
+    if teaching.options().world == World::Features {
+        return Ok(());
+    }
     let used = || teaching.photographs().iter().filter(|p| !p.left_out_by_person);
     let minimum = if used().any(|p| p.depth.is_some()) { FEWEST_WITH_DEPTH } else { FEWEST_PHOTOGRAPHS };
     let found = used().count();
@@ -96,7 +99,8 @@ fn teach(app: &App, entry: &Entry, work: &mut Work<'_>) -> Result<Value, Stopped
     check_number(&teaching).map_err(fault)?;
     let options = ShapeOptions { stereo: !entry.record().hull_only, ..ShapeOptions::default() };
     let segmenter = app.teachings.segmenter()?;
-    step(work, "finding tags", |progress| teaching.locate(progress))?;
+    let poses = if teaching.options().world == World::Features { "finding poses" } else { "finding tags" };
+    step(work, poses, |progress| teaching.locate(progress))?;
     step(work, "finding the object", |progress| teaching.find_masks(segmenter.as_ref(), &options, progress))?;
     step(work, "making the mesh", |progress| teaching.reconstruct(&options, progress))?;
     work.step(0, 2, "finding symmetries")?;

@@ -2,10 +2,11 @@
 
 use serde::{Deserialize, Serialize};
 use sixfold_mesh::Mesh;
-use sixfold_teach::{By, Photograph, Snapshot};
+use sixfold_teach::{By, Photograph, Snapshot, World};
 use utoipa::ToSchema;
 
 use super::Entry;
+use super::scale::EndsBody;
 use crate::app::App;
 use crate::error::{Answer, Problem};
 use crate::jobs::{JobState, JobView};
@@ -27,6 +28,14 @@ pub(crate) struct TeachingView {
     replace: bool,
     /// Measured length of the ruler on the printed board, millimetres; null: 100.
     ruler: Option<f64>,
+    /// The photographs show no board: poses come from the object's surroundings.
+    without_board: bool,
+    /// Measured length between the two points of `ends`, metres; without a board.
+    length: Option<f64>,
+    /// The ends of that length in photographs, by number.
+    ends: Vec<EndsBody>,
+    /// A mesh was given, to be aligned with the photographs.
+    given_mesh: bool,
     /// The waiting or running job, otherwise the last one.
     job: Option<JobView>,
     /// Why the last job failed.
@@ -34,8 +43,10 @@ pub(crate) struct TeachingView {
     /// The camera with its distortion, if given or found; sizes in pixels.
     #[schema(value_type = Option<Object>)]
     camera: Option<sixfold_geometry::Camera>,
-    /// Error of the tags' corners, pixels, once poses are found.
+    /// Error of the tags' corners, or of the features without a board, pixels, once poses are found.
     rms: Option<f64>,
+    /// Height of the plane on which the object stands, metres in the frame of the poses; null on the board, where it is 0.
+    floor: Option<f64>,
     /// The sheet's least and largest coordinates on the board, metres, once it is found.
     board: Option<[[f64; 2]; 2]>,
     photographs: Vec<PhotographView>,
@@ -103,7 +114,8 @@ pub(crate) enum PhotographState {
     LeftOutByPerson,
 }
 
-/// Links of a photograph. Add `&side=N` for images of at most N pixels (default: 1280).
+/// Links of a photograph. Add `&side=N` for images of at most N pixels (default: 1280), `&as_taken=true` to the image for one with lens
+/// distortion.
 #[derive(Debug, Serialize, ToSchema)]
 pub(crate) struct PhotographLinks {
     /// Itself without lens distortion.
@@ -199,10 +211,15 @@ impl TeachingView {
             hull_only: record.hull_only,
             replace: record.replace,
             ruler: known.options().ruler.map(|m| 1000.0 * m),
+            without_board: known.options().world == World::Features,
+            length: known.length().map(|length| length.metres),
+            ends: known.length().map(EndsBody::all).unwrap_or_default(),
+            given_mesh: known.has_given_mesh(),
             job: job.map(|job| JobView::of(app, &job)),
             problem: record.problem,
             camera: known.camera().copied().or(known.options().camera),
             rms: known.rms(),
+            floor: known.floor().map(|plane| plane.offset),
             board: known.board().map(|b| b.extent().map(|corner| [corner.x, corner.y])),
             photographs: known.photographs().iter().enumerate().map(photograph).collect(),
             mesh,

@@ -1,10 +1,12 @@
 // Drives the pages of `sixfold serve` in a real browser, as a user would: adds an object, turns it, finds it in the demo's frame,
 // downloads the result, proposes grasps; teaches an object from photographs, corrects a pose and a mask, accepts it, finds it in
-// another image; at a wide and a narrow size, with an image of each page.
+// another image; teaches one without a board, with a length marked by mouse, then with a mesh; at a wide and a narrow size, with an
+// image of each page.
 //
 //   npm install                                       (in this folder or a copy of it)
 //   cargo run --release -p sixfold-teach --example photographs -- data/demo/models/obj_000009.ply mm PHOTOGRAPHS
-//   node pages.mjs SIXFOLD DEMO OUT PHOTOGRAPHS [CHROMIUM]
+//   cargo run --release -p sixfold-teach --example photographs -- data/demo/models/obj_000009.ply mm CLOTH 16 cloth
+//   node pages.mjs SIXFOLD DEMO OUT PHOTOGRAPHS CLOTH [CHROMIUM]
 //
 // SIXFOLD is the program built with the feature `serve`, DEMO the folder data/demo, OUT a folder for images.
 // Exits with 1 and a message at the first thing that is not as it should be.
@@ -16,8 +18,8 @@ import { tmpdir } from "node:os";
 import { join } from "node:path";
 import { chromium } from "playwright-core";
 
-const [program, demo, out, photographs, browserPath = "/usr/bin/chromium"] = process.argv.slice(2);
-assert(program && demo && out && photographs, "usage: node pages.mjs SIXFOLD DEMO OUT PHOTOGRAPHS [CHROMIUM]");
+const [program, demo, out, photographs, cloth, browserPath = "/usr/bin/chromium"] = process.argv.slice(2);
+assert(program && demo && out && photographs && cloth, "usage: node pages.mjs SIXFOLD DEMO OUT PHOTOGRAPHS CLOTH [CHROMIUM]");
 
 const SIZES = { wide: { width: 1280, height: 860 }, narrow: { width: 390, height: 844 } };
 const frame = ["depth/000003.png", "rgb/000003.png"].map((file) => join(demo, "test/000002", file));
@@ -324,6 +326,133 @@ async function teach(page, address) {
   await shot(page, "teach-found");
 }
 
+const LENGTH = 0.2;
+
+/** The pixels at which a photograph on the cloth shows the two ends of the length. */
+async function trueEnds(number) {
+  const read = async (name) => JSON.parse(await readFile(join(cloth, name), "utf8"));
+  const [camera, truth] = [await read("camera.json"), await read("truth.json")];
+  const pose = truth.camera_from_board[number];
+  const seen = (p) => {
+    const [x, y, z] = [0, 1, 2].map((i) => pose[i][0] * p[0] + pose[i][1] * p[1] + pose[i][2] * p[2] + pose[i][3]);
+    return [(camera.fx * x) / z + camera.cx, (camera.fy * y) / z + camera.cy];
+  };
+  return { width: camera.width, ends: [seen([-0.08, -0.06, 0]), seen([0.08, 0.06, 0])] };
+}
+
+/** Marks the ends of a length in three photographs: a mark is moved, one removed, one set while zoomed in, one left out. */
+async function endsMarked(page) {
+  const numbers = [0, 5, 8];
+  const [first, second, third] = await Promise.all(numbers.map(trueEnds));
+  const place = async ({ width }, [u, v]) => {
+    const box = await page.locator("#canvas").boundingBox();
+    const k = box.width / width;
+    return [box.x + (u + 0.5) * k, box.y + (v + 0.5) * k];
+  };
+  const click = async (photograph, pixel) => page.mouse.click(...(await place(photograph, pixel)));
+  await page.getByRole("button", { name: "Mark the ends" }).click();
+  await page.locator('#editor[data-shown="0"]').waitFor();
+  // Somewhere else first, then moved to where it is.
+  const beside = first.ends[0].map((v) => v + 40);
+  await click(first, beside);
+  await page.mouse.move(...(await place(first, beside)));
+  await page.mouse.down();
+  await page.mouse.move(...(await place(first, first.ends[0])), { steps: 5 });
+  await page.mouse.up();
+  // The other end is chosen by itself; a wrong mark is removed.
+  await click(first, first.ends[1].map((v) => v - 50));
+  await page.locator('#ends button[data-end="1"][aria-pressed="true"]').waitFor();
+  await page.getByRole("button", { name: "Remove the mark" }).click();
+  assert(await page.locator("#end-remove").isDisabled(), "there is no mark any more");
+  await click(first, first.ends[1]);
+  await shot(page, "teach-ends");
+  await page.locator("#editor-close").click();
+  // Zoomed in, the photograph is shown larger around the pointer, which stays on its pixel.
+  await opened(page, numbers[1]);
+  const at = await place(second, second.ends[0]);
+  await page.mouse.move(...at);
+  await page.mouse.wheel(0, -600);
+  await page.waitForTimeout(200);
+  await page.mouse.click(...at);
+  await page.getByRole("button", { name: "Zoom out" }).click();
+  await page.getByRole("button", { name: "Zoom out" }).click();
+  await click(second, second.ends[1]);
+  // The third one by the buttons; it has the first end only.
+  for (let i = numbers[1]; i < numbers[2]; i++) {
+    await page.locator("#ends-next").click();
+    await page.locator(`#editor[data-shown="${i + 1}"]`).waitFor();
+  }
+  await click(third, third.ends[0]);
+  await page.locator("#editor-close").click();
+  return [first.ends, second.ends, [third.ends[0], null]];
+}
+
+async function teachWithoutBoard(page, address) {
+  await page.goto(`${address}/teach`);
+  const names = (await readdir(join(cloth, "photographs"))).sort();
+  const files = names.map((name) => join(cloth, "photographs", name));
+  await page.locator("#any").setInputFiles([...files, join(cloth, "camera.json")]);
+  await page.getByLabel("without a board").check();
+  await page.getByLabel("Name of the object").fill("cloth");
+  await page.getByText("Ruler, depth and mesh").click();
+  assert(await page.locator("#ruler-row").isHidden(), "there is no ruler without the board");
+  await page.getByLabel("Do not search for hollows").check();
+  await shot(page, "teach-without-board-form");
+  await page.getByRole("button", { name: "Teach", exact: true }).click();
+  await page.getByText("The photographs are stored.").waitFor({ timeout: 60000 });
+  assert(await page.locator("#run").isDisabled(), "without the scale nothing can begin");
+  // A length alone is refused with what is missing.
+  await page.getByLabel("Length, millimetres").fill("200");
+  await page.getByRole("button", { name: "Begin" }).click();
+  await page.locator("#status .problem").waitFor();
+  assert.match(await page.locator("#status").innerText(), /ends: found nothing/);
+  const truth = await endsMarked(page);
+  const marked = "End 1 is marked in 3 photographs, end 2 in 2 photographs.";
+  assert.equal(await page.locator("#marked").innerText(), marked);
+  assert.match(await page.locator('.tile[data-number="8"]').innerText(), /end 1 marked/);
+  // Marks that are not saved yet outlive a reload.
+  await page.reload();
+  await page.getByText(marked).waitFor();
+  await page.getByLabel("Length, millimetres").fill("200");
+  await page.getByRole("button", { name: "Save length and ends" }).click();
+  await page.getByText("Length and ends are saved.").waitFor();
+  const saved = await teachingOf(page, address);
+  assert.equal(saved.length, LENGTH);
+  assert.deepEqual(saved.ends.map((e) => e.photograph), [0, 5, 8]);
+  saved.ends.forEach(({ points }, i) => points.forEach((point, end) => {
+    const expected = truth[i][end];
+    if (!expected) return assert.equal(point, null);
+    const far = Math.hypot(point[0] - expected[0], point[1] - expected[1]);
+    // The browser reports the pointer in whole pixels of the screen.
+    return assert(far < 1.5, `end ${end + 1} of mark ${i}: ${far.toFixed(2)} pixels from where it is`);
+  }));
+  await shot(page, "teach-scale");
+  await page.getByRole("button", { name: "Begin" }).click();
+  await page.getByText(/Working: finding poses/).waitFor({ timeout: 60000 });
+  await page.locator('#state[data-state="taught"]').waitFor({ timeout: 600000 });
+  const { mesh, rms } = await teachingOf(page, address);
+  const ratio = mesh.diameter / 0.109;
+  assert(Math.abs(ratio - 1) < 0.06 && rms < 2, `diameter ${mesh.diameter} m, features ${rms} pixels off`);
+  console.log(`teach: without a board the diameter is ${(100 * (ratio - 1)).toFixed(1)} % off`);
+  await shot(page, "teach-without-board");
+  // The mesh itself, which cannot be combined with that setting.
+  await page.getByText("Ruler, depth and mesh").click();
+  await page.locator("#mesh-file").setInputFiles(join(demo, "models/obj_000009.ply"));
+  await page.getByLabel("Unit of the mesh").selectOption("mm");
+  await page.getByRole("button", { name: "Add the chosen files" }).click();
+  await page.locator("#status .problem").waitFor();
+  assert.match(await page.locator("#status").innerText(), /hull_only/);
+  await page.getByLabel("Do not search for hollows").uncheck();
+  await page.getByRole("button", { name: "Add the chosen files" }).click();
+  await page.getByText(/Working: making the mesh/).waitFor({ timeout: 60000 });
+  await page.locator('#state[data-state="taught"]').waitFor({ timeout: 600000 });
+  const given = await teachingOf(page, address);
+  assert(given.given_mesh && Math.abs(given.mesh.diameter - 0.1089) < 0.001, `a mesh of ${given.mesh.diameter} m`);
+  await shot(page, "teach-mesh");
+  await page.getByLabel("Forget the given mesh").check();
+  await page.getByRole("button", { name: "Apply the settings" }).waitFor();
+}
+
 const folder = await mkdtemp(join(tmpdir(), "sixfold-pages-"));
 await mkdir(out, { recursive: true });
 let server, browser;
@@ -350,7 +479,7 @@ try {
     if (!url.startsWith(started.address) && !/^(blob|data):/.test(url)) faults.push(`asked for ${url}`);
   });
   page.setDefaultTimeout(30000);
-  const pages = { objects, find, grasp, teach };
+  const pages = { objects, find, grasp, teach, teachWithoutBoard };
   const wanted = (process.env.PAGES || Object.keys(pages).join()).split(",");
   for (const name of wanted) await pages[name](page, started.address);
   assert.deepEqual(faults, []);

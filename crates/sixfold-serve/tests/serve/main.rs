@@ -9,3 +9,5 @@ mod restart;
 mod support;
 #[cfg(feature = "networks")]
 mod teach;
+#[cfg(feature = "networks")]
+mod teach_without_board;

@@ -11,10 +11,10 @@ use sixfold_teach::simulation::{SimulatedCapture, SimulationOptions};
 use crate::restart::to_be_killed;
 use crate::support::{Form, Reply, TestServer, events, result, send};
 
-const COUNT: usize = 6;
+pub const COUNT: usize = 6;
 
 /// A red block with a narrower blue one on it, off centre.
-fn body() -> Mesh {
+pub fn body() -> Mesh {
     let block = |low: [f64; 3], high: [f64; 3], color: [u8; 3]| {
         let corner = |i: usize| {
             let pick = |k: usize| if (i >> k) & 1 == 0 { low[k] } else { high[k] };
@@ -35,14 +35,14 @@ fn camera() -> Camera {
     Camera::new(470.0, 470.0, 240.0, 180.0, 480, 360).unwrap()
 }
 
-struct Photographs {
+pub struct Photographs {
     files: Vec<Vec<u8>>,
     depth: Vec<Vec<u8>>,
-    masks: Vec<Mask>,
+    pub masks: Vec<Mask>,
     camera_from_board: Vec<Pose>,
 }
 
-fn photographs() -> &'static Photographs {
+pub fn photographs() -> &'static Photographs {
     static ONCE: OnceLock<Photographs> = OnceLock::new();
     ONCE.get_or_init(|| {
         let options = SimulationOptions {
@@ -65,14 +65,14 @@ fn photographs() -> &'static Photographs {
 }
 
 /// The bytes of a file that a function of `sixfold-io` writes.
-fn written(write: impl FnOnce(&std::path::Path)) -> Vec<u8> {
+pub fn written(write: impl FnOnce(&std::path::Path)) -> Vec<u8> {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("image.png");
     write(&path);
     std::fs::read(path).unwrap()
 }
 
-fn png(image: &RgbImage) -> Vec<u8> {
+pub fn png(image: &RgbImage) -> Vec<u8> {
     written(|path| sixfold_io::write_rgb(path, image).unwrap())
 }
 
@@ -80,7 +80,7 @@ fn depth_png(depth: &DepthImage) -> Vec<u8> {
     written(|path| sixfold_io::write_depth(path, depth, 1e-3).unwrap())
 }
 
-fn mask_png(mask: &Mask) -> Vec<u8> {
+pub fn mask_png(mask: &Mask) -> Vec<u8> {
     written(|path| sixfold_io::write_mask(path, mask).unwrap())
 }
 
@@ -92,21 +92,21 @@ fn with_camera(form: Form) -> Form {
 }
 
 /// The first photographs as a form.
-fn form(name: &str, count: usize) -> Form {
+pub fn form(name: &str, count: usize) -> Form {
     let form = with_camera(Form::default().text("name", name).text("hull_only", "true"));
     let files = photographs().files.iter().take(count).enumerate();
     files.fold(form, |form, (i, file)| form.file("photographs", &format!("{i}.png"), file))
 }
 
-fn put(server: &TestServer, path: &str, body: &[u8]) -> Reply {
+pub fn put(server: &TestServer, path: &str, body: &[u8]) -> Reply {
     send(server.address, "PUT", path, &[], body)
 }
 
-fn post(server: &TestServer, path: &str) -> Reply {
+pub fn post(server: &TestServer, path: &str) -> Reply {
     send(server.address, "POST", path, &[], b"")
 }
 
-fn id_of(value: &Value) -> String {
+pub fn id_of(value: &Value) -> String {
     value["id"].as_str().unwrap().to_owned()
 }
 
@@ -114,7 +114,7 @@ fn job_of(teaching: &Value) -> String {
     id_of(&teaching["job"])
 }
 
-fn decoded(reply: &Reply) -> RgbImage {
+pub fn decoded(reply: &Reply) -> RgbImage {
     sixfold_io::ImageFile::of_bytes(std::path::Path::new("image"), &reply.body).rgb().unwrap()
 }
 
