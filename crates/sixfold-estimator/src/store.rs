@@ -713,6 +713,25 @@ mod tests {
         assert_eq!(std::fs::read_dir(root.path().join("store")).unwrap().count(), 1);
     }
 
+    #[test]
+    fn data_are_added_to_an_object_that_is_there() {
+        let root = tempfile::tempdir().unwrap();
+        let store = ObjectStore::new(root.path());
+        let write = |object: &Object| Ok(std::fs::write(object.file("weights.bin").unwrap(), b"weights")?);
+        assert!(matches!(store.extend("part", write), Err(StoreError::Unknown { .. })));
+        add(&store, 1.0, false, Ok(())).unwrap();
+        store.extend("part", write).unwrap();
+        for kept in ["weights.bin", "kept.bin"] {
+            assert!(store.load("part").unwrap().file(kept).unwrap().is_file(), "{kept}");
+        }
+        let failed = store.extend("part", |_| Err("the disk is full".into())).unwrap_err();
+        assert!(std::error::Error::source(&failed).unwrap().to_string().contains("the disk is full"));
+        // Nobody else changes it meanwhile.
+        let meanwhile = store.extend("part", |_| Ok(store.remove("part")?)).unwrap_err();
+        assert!(std::error::Error::source(&meanwhile).unwrap().to_string().contains("another process"));
+        assert_eq!(store.names().unwrap(), ["part"]);
+    }
+
     /// Both kinds of failure between the two renames: the second one fails, or the process dies.
     #[test]
     fn a_replacement_that_ends_between_its_two_renames_loses_nothing() {

@@ -22,7 +22,7 @@ use sixfold_teach::photographs_of;
 
 use crate::folder::{Contents, DatasetFolder};
 use crate::new_views::{ChosenBy, NewViews, Refinement, add_contents};
-use crate::training::{command_line, train_pix2pose};
+use crate::training::train_pix2pose;
 
 /// Default number of training steps.
 pub const STEPS: usize = 2000;
@@ -132,7 +132,10 @@ impl ObjectTraining<'_> {
             steps: Some(self.steps as u64),
             per_object: Some(IMAGES),
             render_share: RENDERS,
-            command: command_line(),
+            command: format!(
+                "sixfold teach {name} --train --train-steps {} --view-step {}",
+                self.steps, self.view_step
+            ),
             ..Pix2PoseRecipe::default()
         };
         let out = out.join(format!("pix2pose-{}-{}", self.view_step, self.steps));
