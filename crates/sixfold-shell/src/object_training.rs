@@ -25,7 +25,7 @@ use crate::new_views::{ChosenBy, NewViews, Refinement, add_contents};
 use crate::training::train_pix2pose;
 
 /// Default number of training steps.
-pub const STEPS: usize = 2000;
+pub const STEPS: usize = 3000;
 /// Default step between synthesized views in azimuth and elevation, degrees.
 pub const VIEW_STEP: f64 = 10.0;
 /// Images in a training step.

@@ -93,7 +93,7 @@ pub(crate) struct TeachArguments {
 
 fn steps_help() -> String {
     format!(
-        "Training steps (default: {STEPS}, about 20 minutes on two cores, with the views); more steps give better poses"
+        "Training steps (default: {STEPS}, about 12 minutes of processor time with the views); more steps give better poses"
     )
 }
 
