@@ -26,10 +26,10 @@ VIEWS="--dataset $LMO --frames $FRAMES --ids 5,8 --disturb 10,2.86 --step 10 --b
 sixfold synthesize $VIEWS --out "$OUT/views"
 sixfold synthesize $VIEWS --no-refine --out "$OUT/views-unrefined"
 sixfold train pix2pose --dataset "$LMO" --renders-only $SAME --out "$OUT/renders"
-sixfold train pix2pose --dataset "$LMO" --frames "$FRAMES" --render-share 0 $SAME --out "$OUT/real"
+sixfold train pix2pose --dataset "$LMO" --frames "$FRAMES" --render-fraction 0 $SAME --out "$OUT/real"
 sixfold train pix2pose --dataset "$LMO" --frames "$FRAMES" $SAME --out "$OUT/both"
-sixfold train pix2pose --dataset "$OUT/views" --split train_nol --render-share 0 $SAME --out "$OUT/nol"
-sixfold train pix2pose --dataset "$OUT/views-unrefined" --split train_nol --render-share 0 $SAME --out "$OUT/nol-unrefined"
+sixfold train pix2pose --dataset "$OUT/views" --split train_nol --render-fraction 0 $SAME --out "$OUT/nol"
+sixfold train pix2pose --dataset "$OUT/views-unrefined" --split train_nol --render-fraction 0 $SAME --out "$OUT/nol-unrefined"
 for row in renders real both nol nol-unrefined; do
     sixfold estimate --method pix2pose --weights "$OUT/$row/model.safetensors" --dataset "$LMO" --boxes gt \
         --targets "$OUT/targets.json" --out "$OUT/$row.csv" > "$OUT/$row.log"

@@ -151,18 +151,18 @@ panels[1, 1].set_title("poses from colour alone (detector and Pix2Pose)")
 # %% Errors: below a tenth of the diameter a pose counts as right
 labels = sorted(truth)
 for offset, (name, poses) in enumerate([("depth", from_depth), ("colour", from_colour)]):
-    shares = [judge(meshes[i], poses[i], truth[i])[1] if i in poses else np.nan for i in labels]
-    right = np.nansum(np.array(shares) < 0.1)
+    fractions = [judge(meshes[i], poses[i], truth[i])[1] if i in poses else np.nan for i in labels]
+    right = np.nansum(np.array(fractions) < 0.1)
     panels[1, 2].bar(
         np.arange(len(labels)) + 0.4 * offset - 0.2,
-        np.minimum(shares, 0.5),
+        np.minimum(fractions, 0.5),
         0.38,
         color=COLORS[5 * offset + 1],
         label=f"{name}: {right} of {len(labels)} right",
     )
-    for i, share in zip(labels, shares):
+    for i, fraction in zip(labels, fractions):
         print(
-            f"  {name:6} object {i:2}: " + ("not found" if np.isnan(share) else f"{100 * share:5.1f} % of the diameter")
+            f"  {name:6} object {i:2}: " + ("not found" if np.isnan(fraction) else f"{100 * fraction:5.1f} % of the diameter")
         )
 panels[1, 2].axhline(0.1, color="black", linewidth=1)
 panels[1, 2].set_xticks(range(len(labels)), [str(i) for i in labels])

@@ -111,10 +111,10 @@ impl Detector {
             self.model.check_object(*id).map_err(about("object_ids"))?;
         }
         let options = DetectOptions {
-            threshold: share("threshold", threshold.unwrap_or(f64::from(self.threshold())))?,
-            overlap: share("overlap", overlap)?,
+            threshold: fraction("threshold", threshold.unwrap_or(f64::from(self.threshold())))?,
+            overlap: fraction("overlap", overlap)?,
             per_class: whole("per_object", per_object, 1)?,
-            most: whole("max_detections", max_detections, 1)?,
+            max_detections: whole("max_detections", max_detections, 1)?,
             masks,
         };
         let model = self.model.clone();
@@ -146,7 +146,7 @@ impl Detector {
 }
 
 /// 0 to 1.
-fn share(argument: &str, value: f64) -> PyResult<f32> {
+fn fraction(argument: &str, value: f64) -> PyResult<f32> {
     if (0.0..=1.0).contains(&value) {
         Ok(value as f32)
     } else {

@@ -52,7 +52,7 @@ pub(crate) struct PyGrasp {
     #[pyo3(get)]
     score: f64,
     /// What experience says of it, a dict, or None for grasps by geometry alone: kind ("geometry" or "experience", where
-    /// the grasp comes from), share (of experience that agrees with it, 0 to 1), id (of the experience that it was
+    /// the grasp comes from), agreement (of experience that agrees with it, 0 to 1), id (of the experience that it was
     /// transferred from, or None), distance (of the features), hypothesis (what was assumed about the size).
     #[pyo3(get)]
     experience: Option<Py<PyDict>>,
@@ -103,7 +103,7 @@ struct Proposed {
 #[derive(Clone, Copy)]
 struct Experienced {
     kind: &'static str,
-    share: f64,
+    agreement: f64,
     /// Number, distance and hypothesis of the experience that it was transferred from.
     from: Option<(i64, f64, &'static str)>,
 }
@@ -112,7 +112,7 @@ impl Experienced {
     fn to_python(self, py: Python<'_>) -> PyResult<Py<PyDict>> {
         let dict = PyDict::new(py);
         dict.set_item("kind", self.kind)?;
-        dict.set_item("share", self.share)?;
+        dict.set_item("agreement", self.agreement)?;
         dict.set_item("id", self.from.map(|f| f.0))?;
         dict.set_item("distance", self.from.map(|f| f.1))?;
         dict.set_item("hypothesis", self.from.map(|f| f.2))?;
@@ -203,7 +203,7 @@ pub(crate) fn propose_grasps(
     let default = AntipodalOptions::default();
     let planner = AntipodalOptions { seed, completion: default.completion.filter(|_| !seen_only), ..default };
     let learnt = match experiences {
-        Some(store) => Some((store.get().network(py, weights)?, store.get().share())),
+        Some(store) => Some((store.get().network(py, weights)?, store.get().agreement())),
         None if weights.is_some() || part.is_some() => {
             let argument = if part.is_some() { "part" } else { "weights" };
             return Err(bad(argument, "experiences, which it belongs to", "none"));
@@ -257,7 +257,7 @@ pub(crate) fn propose_grasps(
                 Kind::Experience => "experience",
             };
             let from = from.map(|p| (p.from.experience, p.from.distance, p.hypothesis.name()));
-            let experience = Some(Experienced { kind, share: r.experience, from });
+            let experience = Some(Experienced { kind, agreement: r.experience, from });
             Proposed { grasp: r.grasp, score: r.score, members: r.members, experience }
         });
         Ok::<Vec<Proposed>, GraspError>(learnt.collect())

@@ -358,7 +358,7 @@ pub(crate) struct MttmEstimate {
     #[pyo3(get)]
     mask: Py<PyArray2<bool>>,
     /// By the mesh, or by the template where there is none: rendered, inliers, occluded, outliers (pixels), depth, boundary,
-    /// normals, total (0 to 1), visible_share.
+    /// normals, total (0 to 1), visible_fraction.
     #[pyo3(get)]
     verification: Py<PyDict>,
 }

@@ -249,7 +249,7 @@ pub(crate) struct SynthesizedView {
     unseen: Py<PyArray2<bool>>,
     /// Fraction of the object's pixels that no photograph shows, 0 to 1.
     #[pyo3(get)]
-    unseen_share: f64,
+    unseen_fraction: f64,
     /// Numbers of the photographs that were used.
     #[pyo3(get)]
     sources: Vec<usize>,
@@ -258,7 +258,7 @@ pub(crate) struct SynthesizedView {
 impl SynthesizedView {
     fn of(py: Python<'_>, view: NewView) -> PyResult<Self> {
         Ok(SynthesizedView {
-            unseen_share: view.unseen_fraction(),
+            unseen_fraction: view.unseen_fraction(),
             rgb: arrays::from_image_of(py, free(py, || view.patch.to_rgb())?)?.unbind(),
             mask: arrays::from_image(py, view.mask)?.unbind(),
             unseen: arrays::from_image(py, view.unseen)?.unbind(),
@@ -270,7 +270,7 @@ impl SynthesizedView {
 #[pymethods]
 impl SynthesizedView {
     fn __repr__(&self) -> String {
-        format!("<SynthesizedView: {:.0} % unseen>", 100.0 * self.unseen_share)
+        format!("<SynthesizedView: {:.0} % unseen>", 100.0 * self.unseen_fraction)
     }
 }
 

@@ -162,7 +162,7 @@ pub(crate) struct PpfEstimate {
     #[pyo3(get)]
     votes: f32,
     /// The verification by rendering (dissertation, section 5.2.5): rendered, inliers, occluded, outliers (pixels), depth,
-    /// boundary, normals, total (0 to 1), visible_share.
+    /// boundary, normals, total (0 to 1), visible_fraction.
     #[pyo3(get)]
     verification: Py<PyDict>,
 }
@@ -289,7 +289,7 @@ pub(crate) fn verification_to_python(py: Python<'_>, s: &VerificationScore) -> P
         ("boundary", s.boundary),
         ("normals", s.normals),
         ("total", s.total),
-        ("visible_share", s.visible_fraction()),
+        ("visible_fraction", s.visible_fraction()),
     ] {
         verification.set_item(name, value)?;
     }

@@ -19,7 +19,7 @@ use crate::training::{Source, checked, choice, count, run, single, steps, summar
 /// frames: pairs (scene_id, im_id) of photographs to learn from, all of the split if None; renders_only=True opens none.
 /// network: "compact", which trains on two cores, or the dissertation's "paper" and "resnet50" for one object; steps,
 /// per_object (images of every object in a step) and learning_rate have its defaults if None. adversarial: against a
-/// discriminator; if None, all but the compact network. render_share and
+/// discriminator; if None, all but the compact network. render_fraction and
 /// near_photographs: fraction of renders, and of those near a photograph's pose; rotation: largest rotation of photographs in the
 /// image plane, radians, 45 degrees if None; size: pixels of the network's input; init: a model to continue from; encoder: torchvision's ResNet-50
 /// weights for "resnet50"; backgrounds: a folder of photographs; preset: symmetries, thresholds
@@ -35,7 +35,7 @@ use crate::training::{Source, checked, choice, count, run, single, steps, summar
 /// >>> trained = train_pix2pose("data/demo", "out/pix2pose", ids=[8], steps=200, progress=print)  # doctest: +SKIP
 /// >>> pix2pose = Pix2Pose.load(trained["model"])  # doctest: +SKIP
 #[pyfunction]
-#[pyo3(signature = (material, out, *, ids=None, frames=None, split=None, renders_only=false, network=None, steps=None, per_object=None, learning_rate=None, adversarial=None, frozen_stages=None, render_share=None, near_photographs=None, rotation=None, size=None, init=None, encoder=None, backgrounds=None, mesh_colors=None, convex_hull=None, transformer_loss=None, view_limits=None, preset=None, progress=None, seed=None))]
+#[pyo3(signature = (material, out, *, ids=None, frames=None, split=None, renders_only=false, network=None, steps=None, per_object=None, learning_rate=None, adversarial=None, frozen_stages=None, render_fraction=None, near_photographs=None, rotation=None, size=None, init=None, encoder=None, backgrounds=None, mesh_colors=None, convex_hull=None, transformer_loss=None, view_limits=None, preset=None, progress=None, seed=None))]
 #[allow(clippy::too_many_arguments)]
 pub(crate) fn train_pix2pose<'py>(
     py: Python<'py>,
@@ -51,7 +51,7 @@ pub(crate) fn train_pix2pose<'py>(
     learning_rate: Option<f64>,
     adversarial: Option<bool>,
     frozen_stages: Option<i64>,
-    render_share: Option<f64>,
+    render_fraction: Option<f64>,
     near_photographs: Option<f64>,
     rotation: Option<f64>,
     size: Option<i64>,
@@ -78,7 +78,7 @@ pub(crate) fn train_pix2pose<'py>(
         adversarial,
         encoder,
         frozen_stages: count("frozen_stages", frozen_stages, default.frozen_stages)?,
-        render_share: single(render_share, default.render_share),
+        render_fraction: single(render_fraction, default.render_fraction),
         near_photographs: single(near_photographs, default.near_photographs),
         rotation: single(rotation, default.rotation),
         size: count("size", size, default.size)?,
@@ -105,9 +105,9 @@ pub(crate) fn train_pix2pose<'py>(
 ///
 /// material, out, ids, frames, split, renders_only, init, backgrounds, progress, Ctrl-C and going on: as train_pix2pose.
 /// network: "compact", "retinanet" (without anchors), or the dissertation's "faster-rcnn", "mask-rcnn" and "retinanet-anchors", which need
-/// backbone="lite0" (EfficientNet-Lite0) or encoder: torchvision's weights of ResNet-50 or of the same network; batch: images in a step; encoder_share: the pretrained encoder's
-/// fraction of the learning rate; size: side of the training images in pixels, a multiple of 32; photograph_share: fraction of
-/// training images that are parts of photographs; render_share: fraction of renders among pasted objects; rotation: largest rotation
+/// backbone="lite0" (EfficientNet-Lite0) or encoder: torchvision's weights of ResNet-50 or of the same network; batch: images in a step; encoder_rate: the pretrained encoder's
+/// fraction of the learning rate; size: side of the training images in pixels, a multiple of 32; photograph_fraction: fraction of
+/// training images that are parts of photographs; render_fraction: fraction of renders among pasted objects; rotation: largest rotation
 /// in the image plane, radians, 15 degrees if None; longest_side: larger images are reduced to so many pixels before detection; threshold: score
 /// below which detections are left out by default.
 ///
@@ -116,7 +116,7 @@ pub(crate) fn train_pix2pose<'py>(
 /// >>> trained = train_detector("data/demo", "out/detector", steps=200)  # doctest: +SKIP
 /// >>> detector = Detector.load(trained["model"])  # doctest: +SKIP
 #[pyfunction]
-#[pyo3(signature = (material, out, *, ids=None, frames=None, split=None, renders_only=false, network=None, backbone=None, steps=None, batch=None, learning_rate=None, encoder_share=None, frozen_stages=None, size=None, photograph_share=None, render_share=None, rotation=None, longest_side=None, threshold=None, init=None, encoder=None, backgrounds=None, mesh_colors=None, progress=None, seed=None))]
+#[pyo3(signature = (material, out, *, ids=None, frames=None, split=None, renders_only=false, network=None, backbone=None, steps=None, batch=None, learning_rate=None, encoder_rate=None, frozen_stages=None, size=None, photograph_fraction=None, render_fraction=None, rotation=None, longest_side=None, threshold=None, init=None, encoder=None, backgrounds=None, mesh_colors=None, progress=None, seed=None))]
 #[allow(clippy::too_many_arguments)]
 pub(crate) fn train_detector<'py>(
     py: Python<'py>,
@@ -131,11 +131,11 @@ pub(crate) fn train_detector<'py>(
     steps: Option<i64>,
     batch: Option<i64>,
     learning_rate: Option<f64>,
-    encoder_share: Option<f64>,
+    encoder_rate: Option<f64>,
     frozen_stages: Option<i64>,
     size: Option<i64>,
-    photograph_share: Option<f64>,
-    render_share: Option<f64>,
+    photograph_fraction: Option<f64>,
+    render_fraction: Option<f64>,
     rotation: Option<f64>,
     longest_side: Option<i64>,
     threshold: Option<f64>,
@@ -155,12 +155,12 @@ pub(crate) fn train_detector<'py>(
         steps: self::steps(steps)?.unwrap_or(default.steps),
         batch: count("batch", batch, default.batch)?,
         learning_rate: learning_rate.unwrap_or(default.learning_rate),
-        encoder_share: encoder_share.unwrap_or(default.encoder_share),
+        encoder_rate: encoder_rate.unwrap_or(default.encoder_rate),
         frozen_stages: count("frozen_stages", frozen_stages, default.frozen_stages)?,
         encoder,
         size: count("size", size, default.size)?,
-        photograph_share: single(photograph_share, default.photograph_share),
-        render_share: single(render_share, default.render_share),
+        photograph_fraction: single(photograph_fraction, default.photograph_fraction),
+        render_fraction: single(render_fraction, default.render_fraction),
         rotation: single(rotation, default.rotation),
         mesh_colors: mesh_colors.unwrap_or(default.mesh_colors),
         longest_side: count("longest_side", longest_side, default.longest_side)?,

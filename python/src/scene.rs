@@ -151,14 +151,14 @@ impl PyPlane {
 }
 
 /// The plane that holds most of the points (N, 3), found by RANSAC (Fischler and Bolles 1981), normal to the origin; None
-/// when none holds `min_share` of them. threshold in metres; with normals (N, 3) these must agree within 30 degrees.
+/// when none holds `min_fraction` of them. threshold in metres; with normals (N, 3) these must agree within 30 degrees.
 ///
 /// >>> import numpy as np
 /// >>> grid = np.stack(np.meshgrid(np.linspace(-1, 1, 20), np.linspace(-1, 1, 20), [1.0]), -1).reshape(-1, 3)
 /// >>> dominant_plane(grid).normal.round(6) + 0
 /// array([ 0.,  0., -1.])
 #[pyfunction]
-#[pyo3(signature = (points, normals=None, *, threshold=0.01, iterations=300, min_share=0.15, seed=0))]
+#[pyo3(signature = (points, normals=None, *, threshold=0.01, iterations=300, min_fraction=0.15, seed=0))]
 #[allow(clippy::too_many_arguments)]
 pub(crate) fn dominant_plane(
     py: Python<'_>,
@@ -166,7 +166,7 @@ pub(crate) fn dominant_plane(
     normals: Option<&Bound<'_, PyAny>>,
     threshold: f64,
     iterations: i64,
-    min_share: f64,
+    min_fraction: f64,
     seed: i64,
 ) -> PyResult<Option<PyPlane>> {
     let points = arrays::points3("points", points)?;
@@ -181,7 +181,7 @@ pub(crate) fn dominant_plane(
     let options = PlaneOptions {
         threshold: positive("threshold", threshold)?,
         iterations: whole("iterations", iterations, 1)?,
-        min_share,
+        min_fraction,
         ..PlaneOptions::default()
     };
     let (cloud, seed) = (PointCloud { points, normals }, self::seed(seed)?);

@@ -111,7 +111,7 @@ def test_grasps_are_transferred_and_ranked_with_the_planners(store, second, netw
     both = sixfold.propose_grasps(*second, gripper="jaws-85", most=20, experiences=store)
     assert {g.experience["kind"] for g in both} <= {"geometry", "experience"}
     assert [g.score for g in both] == sorted((g.score for g in both), reverse=True)
-    assert all(0 <= g.experience["share"] <= 1 for g in both)
+    assert all(0 <= g.experience["agreement"] <= 1 for g in both)
     # With a part's name what was transferred, here from the one that was stored, and the planner's that hold the same.
     learnt = sixfold.propose_grasps(
         *second, gripper="jaws-85", most=50, experiences=store, weights=network, part="middle"

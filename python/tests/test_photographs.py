@@ -70,9 +70,9 @@ def test_poses_get_better(taken, view_camera, untextured):
     rng = np.random.default_rng(3)
     truth = [t[2] for t in taken]
     rough = [pose @ sixfold.pose_exp([*rng.uniform(-0.006, 0.006, 3), *rng.uniform(-0.04, 0.04, 3)]) for pose in truth]
-    shares = []
-    refined = sixfold.refine_poses(untextured, photographs(taken, view_camera, rough), progress=shares.append)
-    assert shares == sorted(shares) and 0 <= shares[0] and shares[-1] <= 1 and len(shares) > 3
+    fractions = []
+    refined = sixfold.refine_poses(untextured, photographs(taken, view_camera, rough), progress=fractions.append)
+    assert fractions == sorted(fractions) and 0 <= fractions[0] and fractions[-1] <= 1 and len(fractions) > 3
 
     def errors(poses):
         return np.mean([sixfold.metrics.add(untextured, p, t) for p, t in zip(poses, truth)])
@@ -91,7 +91,7 @@ def test_poses_get_better(taken, view_camera, untextured):
     )
     assert (again.camera_from_object == refined.camera_from_object).all()
 
-    def stop(share):
+    def stop(fraction):
         raise RuntimeError("enough")
 
     with pytest.raises(RuntimeError, match="enough"):
@@ -115,7 +115,7 @@ def test_new_views_look_like_the_object(taken, view_camera, untextured, painted,
         truth = sixfold.render(painted, pose, view_camera, lights=[sixfold.AmbientLight((1, 1, 1))])
         assert (view.mask == truth.mask).mean() > 0.995
         assert (view.rgb[~view.mask] == 0).all() and not (view.unseen & ~view.mask).any()
-        assert view.unseen_share == pytest.approx(view.unseen.sum() / view.mask.sum()) and view.unseen_share < 0.1
+        assert view.unseen_fraction == pytest.approx(view.unseen.sum() / view.mask.sum()) and view.unseen_fraction < 0.1
         seen = view.mask & truth.mask & ~view.unseen
         difference = np.abs(view.rgb[seen].astype(int) - truth.rgb[seen]).mean()
         assert difference < 30, (weighting, difference)
@@ -126,7 +126,7 @@ def test_what_no_photograph_shows_is_said(taken, view_camera, untextured):
     [view] = sixfold.synthesize(
         untextured, photographs(taken, view_camera)[:1], [looking(np.pi, 0.3)], view_camera, weighting="best"
     )
-    assert view.unseen_share > 0.5 and view.rgb[view.unseen].any()
+    assert view.unseen_fraction > 0.5 and view.rgb[view.unseen].any()
     assert (
         sixfold.synthesize(
             untextured, photographs(taken, view_camera), np.zeros((0, 4, 4)), view_camera, weighting="best"
@@ -186,4 +186,4 @@ def test_wrong_use(taken, view_camera, untextured, weights, tmp_path):
         sixfold.refine_poses(untextured, [rgb])
     # Behind the camera there is nothing to see.
     [nothing] = sixfold.synthesize(untextured, some, [behind], view_camera, weighting="best")
-    assert not nothing.mask.any() and nothing.unseen_share == 0
+    assert not nothing.mask.any() and nothing.unseen_fraction == 0

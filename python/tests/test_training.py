@@ -204,7 +204,7 @@ def test_wrong_use(demo, colored, weights, tmp_path):
         (lambda: sixfold.train_pix2pose({1: colored}, out, learning_rate=np.nan), "learning_rate"),
         (lambda: sixfold.train_pix2pose({1: colored}, out, size=50), "size"),
         (lambda: sixfold.train_pix2pose({1: colored}, out, rotation=7), "rotation"),
-        (lambda: sixfold.train_pix2pose({1: colored}, out, render_share=2), "render_share"),
+        (lambda: sixfold.train_pix2pose({1: colored}, out, render_fraction=2), "render_fraction"),
         (lambda: sixfold.train_pix2pose({1: colored}, out, network="big"), "network"),
         (lambda: sixfold.train_pix2pose({1: colored}, out, network="paper", size=64), "network"),
         (lambda: sixfold.train_pix2pose({3: colored}, out, init=weights), "object 3"),

@@ -396,7 +396,7 @@ mod tests {
         assert_eq!(named(DepthOptions { inpaint_rounds: 1001, ..options }), "inpaint_rounds");
         let normals = NormalOptions { max_relative_step: -1.0, ..options.normals };
         assert_eq!(named(DepthOptions { normals, ..options }), "normals.max_relative_step");
-        let plane = PlaneOptions { min_share: f64::NAN, ..options.plane };
-        assert_eq!(named(DepthOptions { plane, ..options }), "plane.min_share");
+        let plane = PlaneOptions { min_fraction: f64::NAN, ..options.plane };
+        assert_eq!(named(DepthOptions { plane, ..options }), "plane.min_fraction");
     }
 }

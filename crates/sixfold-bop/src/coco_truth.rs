@@ -180,10 +180,8 @@ impl CocoGroundTruth {
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct FoundAtHalf {
     /// Detections with a lower score were left out.
-    #[serde(rename = "least_score")]
     pub min_score: f64,
     /// Objects at least this visible counted.
-    #[serde(rename = "least_visible")]
     pub min_visibility: f64,
     /// Number of those objects.
     pub objects: usize,

@@ -37,7 +37,7 @@ pub fn backgrounds_with_images(
     images: &[PosedImage],
     objects: &[TrainingObject],
 ) -> Result<Backgrounds, AugmentError> {
-    let (mut backgrounds, share) = plain_backgrounds(folder)?;
+    let (mut backgrounds, fraction) = plain_backgrounds(folder)?;
     let mut frames: Vec<(&Arc<_>, Vec<Rect>)> = vec![];
     for posed in images {
         let Some(object) = objects.iter().find(|o| o.id == posed.object_id()) else { continue };
@@ -67,5 +67,5 @@ pub fn backgrounds_with_images(
     for (image, rects) in frames {
         backgrounds = backgrounds.with_image(image.clone(), rects)?;
     }
-    Ok(backgrounds.with_procedural_fraction(share))
+    Ok(backgrounds.with_procedural_fraction(fraction))
 }

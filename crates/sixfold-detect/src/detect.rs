@@ -19,7 +19,7 @@ pub struct DetectOptions {
     /// Maximum number of detections of a class, the best ones.
     pub per_class: usize,
     /// Maximum number of detections of an image, the best ones.
-    pub most: usize,
+    pub max_detections: usize,
     /// Also compute masks.
     pub masks: bool,
 }
@@ -27,7 +27,7 @@ pub struct DetectOptions {
 impl Default for DetectOptions {
     /// For display and for poses: only confident detections.
     fn default() -> Self {
-        DetectOptions { threshold: 0.4, overlap: 0.5, per_class: 100, most: 100, masks: true }
+        DetectOptions { threshold: 0.4, overlap: 0.5, per_class: 100, max_detections: 100, masks: true }
     }
 }
 
@@ -47,7 +47,9 @@ impl DetectOptions {
                 return Err(format!("detection option {field}: found {value}, expected 0 to 1"));
             }
         }
-        for (field, value) in [("per_class (--per-object)", self.per_class), ("most", self.most)] {
+        for (field, value) in
+            [("per_class (--per-object)", self.per_class), ("max_detections", self.max_detections)]
+        {
             if !(1..=MAX_DETECTIONS).contains(&value) {
                 return Err(format!(
                     "detection option {field}: found {value}, expected 1 to {MAX_DETECTIONS}"
@@ -162,7 +164,7 @@ fn suppress(
     mut candidates: Vec<Candidate>,
     most_overlap: f32,
     per_class: usize,
-    most: usize,
+    max_detections: usize,
 ) -> Vec<Candidate> {
     candidates.sort_by(|a, b| b.score.total_cmp(&a.score));
     let mut kept: Vec<Candidate> = vec![];
@@ -220,7 +222,7 @@ pub fn decode(
     let to_image = |v: f32, last: usize| {
         f64::from(((v + 0.5) * image.step - 0.5).clamp(0.0, last.saturating_sub(1) as f32))
     };
-    suppress(candidates, options.overlap, options.per_class, options.most)
+    suppress(candidates, options.overlap, options.per_class, options.max_detections)
         .into_iter()
         .map(|c| {
             let [left, top, right, bottom] = c.corners;

@@ -364,8 +364,13 @@ fn anchored(
     image: &RgbImage,
     options: &DetectOptions,
 ) -> Vec<Detected> {
-    let DetectOptions { threshold, overlap, per_class, most, masks } = *options;
-    let thresholds = Thresholds { score: threshold, overlap: f64::from(overlap), most, per_label: per_class };
+    let DetectOptions { threshold, overlap, per_class, max_detections, masks } = *options;
+    let thresholds = Thresholds {
+        score: threshold,
+        overlap: f64::from(overlap),
+        most: max_detections,
+        per_label: per_class,
+    };
     let found = network.detect(image, &thresholds, masks);
     let detected = |d: AnchoredDetection| {
         let [left, top, right, bottom] = d.corners.map(f64::from);

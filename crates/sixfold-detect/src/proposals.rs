@@ -65,13 +65,13 @@ impl ProposalsRecipe {
     fn scenes(&self) -> TrainingImageOptions {
         TrainingImageOptions {
             size: self.size,
-            photograph_share: 0.0,
+            photograph_fraction: 0.0,
             empty_fraction: 0.05,
             scale: [0.4, 1.6],
             max_pasted: 10,
             tabletop_fraction: 0.75,
             rotation: std::f32::consts::PI,
-            render_share: 1.0,
+            render_fraction: 1.0,
             max_distractors: 2,
             // Solids are objects here, not distractors.
             solid_fraction: 0.0,

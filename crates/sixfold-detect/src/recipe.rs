@@ -76,7 +76,7 @@ pub struct DetectorRecipe {
     /// Maximum learning rate.
     pub learning_rate: f64,
     /// Learning rate of the pretrained encoder as a fraction of the learning rate, 0 to 1.
-    pub encoder_share: f64,
+    pub encoder_rate: f64,
     /// Number of frozen stages of the ImageNet encoder, of five.
     pub frozen_stages: usize,
     /// torchvision's ResNet-50 weights for [`DetectorKind::Retinanet`]; random ones without. For [`DetectorKind::Anchored`] on ResNet-50,
@@ -85,9 +85,9 @@ pub struct DetectorRecipe {
     /// Side of the training images in pixels, a multiple of 32 (RetinaNet: 128).
     pub size: usize,
     /// Fraction of training images that are parts of photographs, 0 to 1.
-    pub photograph_share: f32,
+    pub photograph_fraction: f32,
     /// Fraction of renders among pasted objects that have photographs, 0 to 1.
-    pub render_share: f32,
+    pub render_fraction: f32,
     /// Largest rotation in the image plane, radians.
     pub rotation: f32,
     /// Render the meshes in their own colours; otherwise in random ones.
@@ -108,7 +108,7 @@ pub struct DetectorRecipe {
 
 impl Default for DetectorRecipe {
     fn default() -> Self {
-        let DetectorTrainingOptions { common, batch, encoder_share, frozen_stages } = Default::default();
+        let DetectorTrainingOptions { common, batch, encoder_rate, frozen_stages } = Default::default();
         let DetectorUse { longest_side, threshold } = DetectorUse::default();
         let samples = TrainingImageOptions::default();
         DetectorRecipe {
@@ -117,12 +117,12 @@ impl Default for DetectorRecipe {
             steps: common.steps,
             batch,
             learning_rate: common.learning_rate,
-            encoder_share,
+            encoder_rate,
             frozen_stages,
             encoder: None,
             size: samples.size,
-            photograph_share: samples.photograph_share,
-            render_share: samples.render_share,
+            photograph_fraction: samples.photograph_fraction,
+            render_fraction: samples.render_fraction,
             rotation: samples.rotation,
             mesh_colors: true,
             longest_side,
@@ -152,8 +152,8 @@ impl DetectorRecipe {
     pub fn published() -> Self {
         DetectorRecipe {
             network: DetectorKind::Retinanet,
-            photograph_share: 0.0,
-            render_share: 0.0,
+            photograph_fraction: 0.0,
+            render_fraction: 0.0,
             ..DetectorRecipe::default()
         }
     }
@@ -164,7 +164,7 @@ impl DetectorRecipe {
         DetectorTrainingOptions {
             common: default.with(Some(self.steps), Some(self.learning_rate), self.seed),
             batch: self.batch,
-            encoder_share: self.encoder_share,
+            encoder_rate: self.encoder_rate,
             frozen_stages: self.frozen_stages,
         }
     }
@@ -172,8 +172,8 @@ impl DetectorRecipe {
     fn scenes(&self) -> TrainingImageOptions {
         TrainingImageOptions {
             size: self.size,
-            photograph_share: self.photograph_share,
-            render_share: self.render_share,
+            photograph_fraction: self.photograph_fraction,
+            render_fraction: self.render_fraction,
             rotation: self.rotation,
             random_color_probability: if self.mesh_colors { 0.0 } else { 1.0 },
             ..TrainingImageOptions::default()
@@ -289,8 +289,8 @@ impl Recipe for DetectorRecipe {
         let DetectorRecipe {
             network, backbone, encoder, init, backgrounds,
             // In the options of training and samples.
-            steps: _, batch: _, learning_rate: _, encoder_share: _, frozen_stages: _, size: _, photograph_share: _,
-            render_share: _, rotation: _, mesh_colors: _, seed: _,
+            steps: _, batch: _, learning_rate: _, encoder_rate: _, frozen_stages: _, size: _, photograph_fraction: _,
+            render_fraction: _, rotation: _, mesh_colors: _, seed: _,
             // These do not affect the training.
             longest_side: _, threshold: _, command: _,
         } = self;

@@ -43,36 +43,28 @@ pub struct TrainingImageOptions {
     /// Side of the training images, pixels; a multiple of 32.
     pub size: usize,
     /// Fraction of images that are parts of photographs, 0..1.
-    pub photograph_share: f32,
+    pub photograph_fraction: f32,
     /// Fraction of images without any object, 0..1.
-    #[serde(rename = "empty_share")]
     pub empty_fraction: f32,
     /// Factors on the size that objects have in the photographs.
     pub scale: [f32; 2],
     /// Largest rotation in the image plane to either side, radians.
     pub rotation: f32,
     /// Maximum number of objects pasted on a background.
-    #[serde(rename = "most_pasted")]
     pub max_pasted: u32,
     /// Maximum number of objects pasted on a part of a photograph.
-    #[serde(rename = "most_added")]
     pub max_added: u32,
     /// Fraction of renders among pasted objects that have photographs, 0..1.
-    pub render_share: f32,
+    pub render_fraction: f32,
     /// Maximum number of distractors: solids, shapes, and outlines of objects filled with something else.
-    #[serde(rename = "most_distractors")]
     pub max_distractors: u32,
     /// Fraction of solids among them, 0..1.
-    #[serde(rename = "solid_share")]
     pub solid_fraction: f32,
     /// Objects with a smaller visible fraction are ignored in the training.
-    #[serde(rename = "least_visible")]
     pub min_visibility: f32,
     /// Probability that a rendered object has random colours.
-    #[serde(rename = "random_color_chance")]
     pub random_color_probability: f32,
     /// Fraction of rendered poses near one of a photograph, 0..1.
-    #[serde(rename = "near_real_share")]
     pub near_real_fraction: f32,
     /// Fraction of images that are rendered as a whole: the objects in their own colours on a table, 0..1.
     #[serde(default, skip_serializing_if = "is_zero")]
@@ -91,13 +83,13 @@ impl Default for TrainingImageOptions {
     fn default() -> Self {
         TrainingImageOptions {
             size: 320,
-            photograph_share: 0.45,
+            photograph_fraction: 0.45,
             empty_fraction: 0.1,
             scale: [0.65, 1.5],
             rotation: 15f32.to_radians(),
             max_pasted: 7,
             max_added: 3,
-            render_share: 0.4,
+            render_fraction: 0.4,
             max_distractors: 5,
             solid_fraction: 0.6,
             min_visibility: 0.15,
@@ -299,7 +291,7 @@ impl TrainingImageSource {
         let kind = random.random::<f32>();
         let mut canvas = if tabletop {
             self.tabletop(random)
-        } else if kind < options.photograph_share && !self.photographs.is_empty() {
+        } else if kind < options.photograph_fraction && !self.photographs.is_empty() {
             let mut canvas = self.photograph(random);
             for _ in 0..random.random_range(0..=options.max_added) {
                 self.paste_object(&mut canvas, random);
@@ -412,8 +404,8 @@ impl TrainingImageSource {
         let class = random.random_range(0..self.objects.len());
         let object = &self.objects[class];
         let can_render = object.drawn.colored || self.options.random_color_probability > 0.0;
-        let render =
-            object.cutouts.is_empty() || (can_render && random.random::<f32>() < self.options.render_share);
+        let render = object.cutouts.is_empty()
+            || (can_render && random.random::<f32>() < self.options.render_fraction);
         let drawn = if render { self.render(object, random) } else { self.cut(object, random) };
         let Some((mut patch, cover)) = drawn else { return };
         let gain = uniform(random, [0.75, 1.25]);
@@ -681,18 +673,18 @@ impl TrainingImageOptions {
         if !self.size.is_multiple_of(32) || !(64..=1024).contains(&self.size) {
             return wrong("size", "a multiple of 32 from 64 to 1024 pixels", self.size.to_string());
         }
-        for (field, share) in [
-            ("photograph_share", self.photograph_share),
+        for (field, fraction) in [
+            ("photograph_fraction", self.photograph_fraction),
             ("empty_fraction", self.empty_fraction),
-            ("render_share", self.render_share),
+            ("render_fraction", self.render_fraction),
             ("solid_fraction", self.solid_fraction),
-            ("least_visible", self.min_visibility),
+            ("min_visibility", self.min_visibility),
             ("random_color_probability", self.random_color_probability),
             ("near_real_fraction", self.near_real_fraction),
             ("tabletop_fraction", self.tabletop_fraction),
         ] {
-            if !(0.0..=1.0).contains(&share) {
-                return wrong(field, "0 to 1", share.to_string());
+            if !(0.0..=1.0).contains(&fraction) {
+                return wrong(field, "0 to 1", fraction.to_string());
             }
         }
         let [low, high] = self.scale;

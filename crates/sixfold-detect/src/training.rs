@@ -25,7 +25,7 @@ pub struct DetectorTrainingOptions {
     /// Images in a step, 1 or more.
     pub batch: usize,
     /// Learning rate of the pretrained encoder as a fraction of the learning rate, 0 to 1.
-    pub encoder_share: f64,
+    pub encoder_rate: f64,
     /// Number of frozen stages of the encoder, 0 to 5.
     pub frozen_stages: usize,
 }
@@ -42,7 +42,7 @@ impl Default for DetectorTrainingOptions {
                 seed: 0,
             },
             batch: 4,
-            encoder_share: 0.3,
+            encoder_rate: 0.3,
             frozen_stages: 2,
         }
     }
@@ -57,7 +57,7 @@ impl DetectorTrainingOptions {
         self.common.check()?;
         OptionError::unless_samples("batch", self.batch, 1, "1 or more")?;
         OptionError::unless_frozen_stages(self.frozen_stages)?;
-        OptionError::unless_fraction("encoder_share", self.encoder_share)
+        OptionError::unless_fraction("encoder_rate", self.encoder_rate)
     }
 }
 
@@ -211,7 +211,7 @@ impl Training for DetectorTraining {
             of_encoder.add(&network.encoder, part.encoder);
             of_heads.add(network, part.heads);
         }
-        let encoder_rate = rate * self.options.encoder_share;
+        let encoder_rate = rate * self.options.encoder_rate;
         self.learner.step_part(encoder_rate, of_encoder.into_gradients(), |network| &mut network.encoder);
         self.learner.step(rate, of_heads.into_gradients());
         [("scores", sums[0]), ("boxes", sums[1]), ("masks", sums[2])]

@@ -58,7 +58,7 @@ fn options(steps: u64, batch: usize, learning_rate: f64) -> DetectorTrainingOpti
     let default = DetectorTrainingOptions::default();
     let common = TrainingOptions { steps, warm_up: 2, learning_rate, ..default.common };
     // All stages learn: nobody trained this ResNet.
-    DetectorTrainingOptions { common, batch, encoder_share: 1.0, frozen_stages: 0 }
+    DetectorTrainingOptions { common, batch, encoder_rate: 1.0, frozen_stages: 0 }
 }
 
 /// Trains in `folder` until the end, or until step `stop_at`: the losses of every step, and the model when it finished.
@@ -128,7 +128,7 @@ fn losses_fall_on_lite0_and_the_file_gives_the_same_network_again() {
     for kind in [AnchoredKind::MaskRcnn, AnchoredKind::RetinaNet] {
         let folder = tempfile::tempdir().unwrap();
         let options = options(30, 2, 1e-3);
-        let options = DetectorTrainingOptions { encoder_share: 0.3, frozen_stages: 2, ..options };
+        let options = DetectorTrainingOptions { encoder_rate: 0.3, frozen_stages: 2, ..options };
         let (losses, path) = run_on(EncoderKind::Lite0, folder.path(), kind, options, None);
         let mean = |of: &[f64]| of.iter().sum::<f64>() / of.len() as f64;
         let (first, last) = (mean(&losses[..5]), mean(&losses[25..]));

@@ -239,7 +239,7 @@ impl Learner<'_> {
         let (held, ending) = try_grasp(&candidate.grasp).map_err(LearnError::Try)?;
         record.attempts.push(Attempt {
             description: fitter.describe(&candidate.grasp),
-            share: candidate.experience,
+            agreement: candidate.experience,
             transferred: candidate.kind == Kind::Experience,
             held,
             gripper: self.gripper.name.clone(),

@@ -34,7 +34,7 @@ const SCARCE: f64 = 0.01;
 const WALL: (f64, f64) = (0.015, 0.035);
 
 /// The inputs for a grasp, each in about -1 to 1.
-fn numbers(d: &GraspDescription, share: f64, transferred: bool) -> Numbers {
+fn numbers(d: &GraspDescription, agreement: f64, transferred: bool) -> Numbers {
     let q = &d.quality;
     let both_sides = |v: f64| 2.0 * v - 1.0;
     let room = d.table_room.unwrap_or(ROOM.1);
@@ -53,7 +53,7 @@ fn numbers(d: &GraspDescription, share: f64, transferred: bool) -> Numbers {
         (room.clamp(ROOM.0, ROOM.1) / 0.02).ln() / 5f64.ln(),
         both_sides(room.clamp(0.0, SCARCE) / SCARCE),
         2.0 * q.total().max(0.03).ln() + 2.0,
-        share,
+        agreement,
         f64::from(u8::from(transferred)),
         wall,
         wall * both_sides(q.alignment),
@@ -85,7 +85,7 @@ impl OutcomeModel {
         let seen: Vec<(Numbers, f64)> = attempts
             .into_iter()
             .filter(|a| a.gripper == gripper && a.check().is_ok())
-            .map(|a| (numbers(&a.description, a.share, a.transferred), f64::from(u8::from(a.held))))
+            .map(|a| (numbers(&a.description, a.agreement, a.transferred), f64::from(u8::from(a.held))))
             .collect();
         let mut model = OutcomeModel {
             attempts: seen.len(),
@@ -140,10 +140,10 @@ impl OutcomeModel {
     pub(crate) fn success_probability(
         &self,
         description: &GraspDescription,
-        share: f64,
+        agreement: f64,
         transferred: bool,
     ) -> f64 {
-        sigmoid(self.weights.dot(&numbers(description, share, transferred)))
+        sigmoid(self.weights.dot(&numbers(description, agreement, transferred)))
     }
 }
 
@@ -166,13 +166,23 @@ mod tests {
     fn attempt(description: GraspDescription, held: bool) -> Attempt {
         let (gripper, object) = ("jaws".to_owned(), "can".to_owned());
         let provenance = "test".to_owned();
-        Attempt { description, share: 0.0, transferred: false, held, gripper, object, time: 0, provenance }
+        Attempt {
+            description,
+            agreement: 0.0,
+            transferred: false,
+            held,
+            gripper,
+            object,
+            time: 0,
+            provenance,
+        }
     }
 
     #[test]
     fn without_attempts_quality_agreement_and_room_decide() {
         let model = OutcomeModel::learn(&[], "jaws");
-        let of = |alignment, share| model.success_probability(&description(alignment, 0.0), share, false);
+        let of =
+            |alignment, agreement| model.success_probability(&description(alignment, 0.0), agreement, false);
         assert!(of(0.9, 0.0) > of(0.5, 0.0));
         assert!(of(0.5, 0.9) > of(0.5, 0.1));
         // The prior from simulated attempts: a lever is worse than none, and so is a table close to the fingers.
@@ -242,7 +252,7 @@ mod tests {
         let mut gradient = (model.weights - Numbers::from(PRIOR)) * PRECISION;
         gradient[0] *= PRECISION_OF_CONSTANT / PRECISION;
         for a in &attempts {
-            let x = numbers(&a.description, a.share, a.transferred);
+            let x = numbers(&a.description, a.agreement, a.transferred);
             gradient += x * (sigmoid(model.weights.dot(&x)) - f64::from(u8::from(a.held)));
         }
         assert!(gradient.amax() < 1e-4, "{gradient}");

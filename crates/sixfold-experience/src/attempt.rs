@@ -9,7 +9,7 @@ pub struct Attempt {
     /// Its description before the trial.
     pub description: GraspDescription,
     /// The fraction of experience that agreed with the grasp, 0 to 1.
-    pub share: f64,
+    pub agreement: f64,
     /// Whether it was transferred from experience; otherwise the planner proposed it.
     pub transferred: bool,
     /// Whether the grasp held the object.
@@ -38,7 +38,7 @@ impl Attempt {
             &mut d.overlap,
             &mut d.lever,
             &mut d.above_middle,
-            &mut self.share,
+            &mut self.agreement,
         ] {
             *v = (*v * 1e6).round() / 1e6;
         }
@@ -62,7 +62,7 @@ impl Attempt {
             ("lever", lever),
             ("above_middle", above_middle),
             ("table_room", table_room.as_ref().unwrap_or(&0.0)),
-            ("share", &self.share),
+            ("agreement", &self.agreement),
         ] {
             if !value.is_finite() {
                 return Err(name);

@@ -278,8 +278,8 @@ mod tests {
         let projected = crop.camera.project(&Vec3::new(0.162, -0.0049, 0.8)).unwrap();
         assert!((projected - Vec2::new(47.5, 47.5)).norm() < 1.5, "{projected}");
         // 10 of 30 cm squared, except for the edges, which have normals as well.
-        let share = crop.pixels().count() as f64 / (96.0 * 96.0);
-        assert!((share - 1.0 / 9.0).abs() < 0.02, "{share}");
+        let fraction = crop.pixels().count() as f64 / (96.0 * 96.0);
+        assert!((fraction - 1.0 / 9.0).abs() < 0.02, "{fraction}");
         for i in crop.pixels() {
             assert!(crop.normals[i][2] < -0.99);
             let projected = crop.camera.project(&crop.point(i)).unwrap();

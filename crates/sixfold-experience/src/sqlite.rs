@@ -657,7 +657,7 @@ mod tests {
             GraspDescription { quality, overlap: 0.0, lever: 0.0, above_middle: 0.0, table_room: None };
         let attempt = Attempt {
             description,
-            share: 0.0,
+            agreement: 0.0,
             transferred: false,
             held: true,
             gripper: "g".to_owned(),

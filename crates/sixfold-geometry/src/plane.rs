@@ -38,14 +38,14 @@ pub struct PlaneOptions {
     /// Number of random samples.
     pub iterations: usize,
     /// Minimum fraction of the points on the plane.
-    pub min_share: f64,
+    pub min_fraction: f64,
     /// Normals, where the cloud has them, must agree within this angle, radians.
     pub max_angle: f64,
 }
 
 impl Default for PlaneOptions {
     fn default() -> Self {
-        PlaneOptions { threshold: 0.01, iterations: 300, min_share: 0.15, max_angle: 30f64.to_radians() }
+        PlaneOptions { threshold: 0.01, iterations: 300, min_fraction: 0.15, max_angle: 30f64.to_radians() }
     }
 }
 
@@ -57,7 +57,7 @@ impl PlaneOptions {
     pub fn check(&self) -> Result<(), OptionError> {
         OptionError::unless_positive("plane.threshold", self.threshold, "metres above 0")?;
         OptionError::unless_some("plane.iterations", self.iterations)?;
-        OptionError::unless_fraction("plane.min_share", self.min_share)?;
+        OptionError::unless_fraction("plane.min_fraction", self.min_fraction)?;
         let angle = "radians above 0, at most a quarter of a turn";
         OptionError::unless_positive("plane.max_angle", self.max_angle, angle)?;
         OptionError::unless_within("plane.max_angle", self.max_angle, ..=FRAC_PI_2, angle)
@@ -98,7 +98,7 @@ pub fn dominant_plane(cloud: &PointCloud, options: &PlaneOptions, seed: u64) -> 
         plane = fit_plane(&inliers)?;
     }
     let support = (0..n).filter(|&i| belongs(&plane, i)).count();
-    (support as f64 >= options.min_share * n as f64).then(|| plane.facing(&Vec3::zeros()))
+    (support as f64 >= options.min_fraction * n as f64).then(|| plane.facing(&Vec3::zeros()))
 }
 
 /// The least-squares plane through at least three points that are not on one line.

@@ -288,7 +288,7 @@ pub fn find_objects(
 ) -> Result<Vec<Mask>, ViewError> {
     let depth = checked(depth, camera, options)?;
     let table = table(&depth, camera, options)
-        .ok_or(ViewError::NoTable { percent: 100.0 * options.plane.min_share })?;
+        .ok_or(ViewError::NoTable { percent: 100.0 * options.plane.min_fraction })?;
     // Objects on the table are above a measured part of it; the background behind the table's edge is not.
     let above = above_table(&depth, camera, Some(&table), options.table_margin);
     let on_table = footprint(&depth, camera, &table, options);

@@ -30,7 +30,7 @@ const RING: (f64, usize) = (0.25, 8);
 const PLANE: PlaneOptions = PlaneOptions {
     threshold: 0.01,
     iterations: 200,
-    min_share: 0.35,
+    min_fraction: 0.35,
     max_angle: std::f64::consts::FRAC_PI_6,
 };
 /// A pixel is on the plane within this multiple of the median distance of the ring's points, about three standard deviations of

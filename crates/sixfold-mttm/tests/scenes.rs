@@ -283,15 +283,15 @@ fn a_hidden_half_does_not_shift_the_pose() {
     let (depth, visible) = render_scene(&[(&part(), truth), (&screen, before)], 5);
     let (_, whole) = render_scene(&[(&part(), truth)], 5);
     let count = |m: &Mask| m.as_slice().iter().filter(|v| **v).count() as f64;
-    let share = count(&visible) / count(&whole);
-    assert!((0.3..0.8).contains(&share), "the screen hides {share}");
+    let fraction = count(&visible) / count(&whole);
+    assert!((0.3..0.8).contains(&fraction), "the screen hides {fraction}");
     // The screen itself resembles parts of the object: it may be named as well, but the object must be among the first.
     let options = MttmOptions { max_instances: 3, ..MttmOptions::default() };
     for object in both_ways(known(true)) {
         let (found, _) = estimate(&prepared(&depth), &object, &options);
         let all: Vec<(f64, f64)> = found.iter().map(|e| off(e, &truth)).collect();
         let best = all.iter().position(|(t, r)| *t < 5.0 && *r < 4.0);
-        let best = best.unwrap_or_else(|| panic!("mm and degrees off: {all:?}, {share:.2} seen"));
+        let best = best.unwrap_or_else(|| panic!("mm and degrees off: {all:?}, {fraction:.2} seen"));
         // The centroid of the visible part lies centimetres from that of the whole.
         assert!(iou(&found[best], &visible, &depth) > 0.6);
     }

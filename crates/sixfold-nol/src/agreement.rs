@@ -116,9 +116,9 @@ mod tests {
             .map(|p| SourceView::new(p, &mesh, side).unwrap())
             .collect();
         let before: Vec<Vec<f32>> = views.iter().map(|v| v.visible.data.clone()).collect();
-        let shares = leave_out_what_differs(&mut views, &mesh);
-        assert!((0.3..0.7).contains(&shares[0]), "{shares:?}");
-        assert!(shares[1..].iter().all(|s| *s < 0.08), "{shares:?}");
+        let fractions = leave_out_what_differs(&mut views, &mesh);
+        assert!((0.3..0.7).contains(&fractions[0]), "{fractions:?}");
+        assert!(fractions[1..].iter().all(|s| *s < 0.08), "{fractions:?}");
         // Left of the centre the pixels are removed, right of it they are kept, and outside the object nothing changes.
         let view = &views[0];
         let column = view.camera.project(&truth[0].translation()).unwrap().x;

@@ -69,8 +69,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         options
     };
     let mut variants = vec![("as it is".to_string(), base.clone())];
-    for share in [0.0, 0.3, 0.7] {
-        variants.push((format!("first pass {share}"), with(&|o| o.first_pass = share)));
+    for fraction in [0.0, 0.3, 0.7] {
+        variants.push((format!("first pass {fraction}"), with(&|o| o.first_pass = fraction)));
     }
     for robust in [0.0, 0.7, 1.5] {
         variants.push((format!("robust {robust}"), with(&|o| o.robust = robust)));

@@ -61,13 +61,13 @@ fn main() -> Result<(), Box<dyn Error>> {
         }
         None => Backgrounds::procedural(),
     };
-    let render_share = match rest.get(1).map(String::as_str) {
+    let render_fraction = match rest.get(1).map(String::as_str) {
         Some("real") => 0.0,
         Some("render") => 1.0,
         _ => 0.5,
     };
     let close = rest.get(3).is_some_and(|word| word == "close");
-    let mut options = SampleOptions { target_size: Some(64), render_share, ..SampleOptions::default() };
+    let mut options = SampleOptions { target_size: Some(64), render_fraction, ..SampleOptions::default() };
     if close {
         options.color = ColorAugmentation::none();
         options.render_color = ColorAugmentation::none();

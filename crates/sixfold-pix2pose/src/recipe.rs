@@ -87,7 +87,7 @@ pub struct Pix2PoseRecipe {
     /// Number of frozen stages of the ImageNet encoder, of five.
     pub frozen_stages: usize,
     /// Fraction of renders among the images, 0 to 1.
-    pub render_share: f32,
+    pub render_fraction: f32,
     /// Fraction of renders whose pose is near that of a photograph, 0 to 1.
     pub near_photographs: f32,
     /// Largest rotation of photographs in the image plane, radians.
@@ -128,7 +128,7 @@ impl Default for Pix2PoseRecipe {
             adversarial: None,
             encoder: None,
             frozen_stages: Pix2PoseTrainingOptions::default().frozen_stages,
-            render_share: samples.render_share,
+            render_fraction: samples.render_fraction,
             near_photographs: samples.near_real_fraction,
             rotation: samples.rotation,
             size: samples.size,
@@ -170,7 +170,7 @@ impl Pix2PoseRecipe {
         let samples = SampleOptions::published(1);
         Pix2PoseRecipe {
             network: NetworkKind::Paper,
-            render_share: samples.render_share,
+            render_fraction: samples.render_fraction,
             rotation: samples.rotation,
             published: true,
             ..Pix2PoseRecipe::default()
@@ -215,7 +215,7 @@ impl Pix2PoseRecipe {
             synchronised_masks: self.published && (self.convex_hull || self.preset == Some(Preset::Tless)),
             size: sizes.input,
             target_size: Some(sizes.output),
-            render_share: self.render_share,
+            render_fraction: self.render_fraction,
             near_real_fraction: self.near_photographs,
             rotation: self.rotation,
             random_color_probability: if self.mesh_colors { 0.0 } else { 1.0 },
@@ -348,7 +348,7 @@ impl Recipe for Pix2PoseRecipe {
         OptionError::unless(fits, "size", self.size, "a multiple of 32 from 32 to 512")?;
         let fits = (0.0..=PI).contains(&self.rotation);
         OptionError::unless(fits, "rotation", self.rotation, "radians from 0 to half a turn")?;
-        OptionError::unless_fraction("render_share", self.render_share)?;
+        OptionError::unless_fraction("render_fraction", self.render_fraction)?;
         OptionError::unless_fraction("near_photographs", self.near_photographs)?;
         OptionError::unless_samples("per_object", self.per_object.unwrap_or(1), 1, "1 or more")?;
         let expected = "1 or more, or weights to begin with, whose alignment is then measured again";
@@ -373,7 +373,7 @@ impl Recipe for Pix2PoseRecipe {
         // Every field by its name, so that the compiler reports a new one.
         #[rustfmt::skip]
         let Pix2PoseRecipe {
-            network, encoder, render_share, near_photographs, rotation, size, init, mesh_colors, convex_hull, view_limits, preset,
+            network, encoder, render_fraction, near_photographs, rotation, size, init, mesh_colors, convex_hull, view_limits, preset,
             published, backgrounds,
             // These are in the training's options.
             steps: _, per_object: _, learning_rate: _, adversarial: _, frozen_stages: _, transformer_loss: _, seed: _,
@@ -387,7 +387,7 @@ impl Recipe for Pix2PoseRecipe {
         let backgrounds = background_files(backgrounds.as_deref()).map_err(TrainError::method)?;
         training
             .with("network", network.name())
-            .with("render_share", *render_share)
+            .with("render_fraction", *render_fraction)
             .with("near_photographs", *near_photographs)
             .with("rotation", *rotation)
             .with("size", *size)

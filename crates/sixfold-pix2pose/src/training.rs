@@ -23,7 +23,7 @@ pub struct Pix2PoseTrainingOptions {
     /// Images of every object in a step, 1 or more.
     pub per_object: usize,
     /// Learning rate of the pretrained encoder as a fraction of the learning rate, 0 to 1.
-    pub encoder_share: f64,
+    pub encoder_rate: f64,
     /// Number of frozen stages of the encoder, 0 to 5.
     pub frozen_stages: usize,
     /// Use the transformer loss (equation 3.2); otherwise plain L1 (equation 3.1).
@@ -52,7 +52,7 @@ impl Default for Pix2PoseTrainingOptions {
                 seed: 0,
             },
             per_object: 4,
-            encoder_share: 0.3,
+            encoder_rate: 0.3,
             frozen_stages: 2,
             transformer_loss: true,
             adversarial: 0.0,
@@ -70,7 +70,7 @@ impl Pix2PoseTrainingOptions {
         OptionError::unless_samples("per_object", self.per_object, 1, "1 or more")?;
         OptionError::unless_frozen_stages(self.frozen_stages)?;
         OptionError::unless_weight("adversarial", f64::from(self.adversarial))?;
-        OptionError::unless_fraction("encoder_share", self.encoder_share)
+        OptionError::unless_fraction("encoder_rate", self.encoder_rate)
     }
 }
 
@@ -219,7 +219,7 @@ impl Training for CompactTraining {
             encoder_gradients.add(&network.encoder, of_encoder);
             decoder_gradients.add(&network.decoders, of_decoders);
         }
-        let encoder_rate = rate * options.encoder_share;
+        let encoder_rate = rate * options.encoder_rate;
         learner.step_part(encoder_rate, encoder_gradients.into_gradients(), |network| &mut network.encoder);
         learner.step_part(rate, decoder_gradients.into_gradients(), |network| &mut network.decoders);
         let mut losses = Losses::from(

@@ -293,7 +293,9 @@ impl ViewsSummary {
         println!(
             "{out}/preview.png: new views; {out}/poses.png: outlines at the given and the refined poses"
         );
-        println!("next: sixfold train pix2pose --dataset {out} --split {split} --render-share 0 --out DIR");
+        println!(
+            "next: sixfold train pix2pose --dataset {out} --split {split} --render-fraction 0 --out DIR"
+        );
     }
 }
 

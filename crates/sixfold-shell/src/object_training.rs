@@ -131,7 +131,7 @@ impl ObjectTraining<'_> {
         let recipe = Pix2PoseRecipe {
             steps: Some(self.steps as u64),
             per_object: Some(IMAGES),
-            render_share: RENDERS,
+            render_fraction: RENDERS,
             command: format!(
                 "sixfold teach {name} --train --train-steps {} --view-step {}",
                 self.steps, self.view_step

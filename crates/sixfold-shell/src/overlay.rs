@@ -30,8 +30,9 @@ pub fn color(index: usize) -> [u8; 3] {
 pub fn depth_picture(depth: &DepthImage) -> RgbImage {
     let mut valid: Vec<f32> = depth.as_slice().iter().copied().filter(|&z| z > 0.0).collect();
     valid.sort_by(f32::total_cmp);
-    let at =
-        |share: f64| valid.get((share * (valid.len().max(1) - 1) as f64) as usize).copied().unwrap_or(1.0);
+    let at = |fraction: f64| {
+        valid.get((fraction * (valid.len().max(1) - 1) as f64) as usize).copied().unwrap_or(1.0)
+    };
     let (near, far) = (at(0.02), at(0.98));
     depth.map(|&z| {
         if z <= 0.0 {

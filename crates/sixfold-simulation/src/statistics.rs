@@ -8,13 +8,13 @@ pub fn wilson_interval(successes: usize, trials: usize) -> (f64, f64) {
 
 /// The same for a mean success rate in which each trial was repeated several times: as wide as if each trial had run once, which is
 /// never too narrow.
-pub fn wilson_interval_of_fraction(share: f64, trials: usize) -> (f64, f64) {
+pub fn wilson_interval_of_fraction(fraction: f64, trials: usize) -> (f64, f64) {
     const Z: f64 = 1.959_963_984_540_054;
     if trials == 0 {
         return (0.0, 1.0);
     }
     let n = trials as f64;
-    let p = share;
+    let p = fraction;
     let centre = (p + Z * Z / (2.0 * n)) / (1.0 + Z * Z / n);
     let half = Z / (1.0 + Z * Z / n) * (p * (1.0 - p) / n + Z * Z / (4.0 * n * n)).sqrt();
     ((centre - half).max(0.0), (centre + half).min(1.0))

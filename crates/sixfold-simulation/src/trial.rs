@@ -388,8 +388,8 @@ impl Run {
         let start = self.palm_at;
         for k in 1..=steps {
             let s = k as f64 / steps as f64;
-            let share = s * s * (3.0 - 2.0 * s);
-            self.step_to(start.with_translation(start.translation() + way * share));
+            let fraction = s * s * (3.0 - 2.0 * s);
+            self.step_to(start.with_translation(start.translation() + way * fraction));
         }
     }
 

@@ -141,7 +141,7 @@ fn views_without_an_object_are_refused_with_a_reason() {
             &stairs,
             camera,
             &ViewOptions {
-                plane: sixfold_geometry::PlaneOptions { min_share: 0.5, ..options.plane },
+                plane: sixfold_geometry::PlaneOptions { min_fraction: 0.5, ..options.plane },
                 ..options
             }
         ),

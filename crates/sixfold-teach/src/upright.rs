@@ -92,7 +92,7 @@ fn table(points: &[Vec3], eyes: &[Vec3], thickness: f64) -> Option<Plane> {
     let options = PlaneOptions {
         threshold: thickness,
         iterations: 1000,
-        min_share: ON_TABLE,
+        min_fraction: ON_TABLE,
         ..PlaneOptions::default()
     };
     let mut left = points.to_vec();

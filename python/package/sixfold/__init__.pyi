@@ -293,7 +293,7 @@ def dominant_plane(
     *,
     threshold: float = 0.01,
     iterations: int = 300,
-    min_share: float = 0.15,
+    min_fraction: float = 0.15,
     seed: int = 0,
 ) -> Plane | None: ...
 def fit_plane(points: ArrayLike) -> Plane: ...
@@ -782,7 +782,7 @@ class SynthesizedView:
     @property
     def unseen(self) -> Bool: ...
     @property
-    def unseen_share(self) -> float: ...
+    def unseen_fraction(self) -> float: ...
     @property
     def sources(self) -> list[int]: ...
 
@@ -866,7 +866,7 @@ def train_pix2pose(
     learning_rate: float | None = None,
     adversarial: bool | None = None,
     frozen_stages: int = 2,
-    render_share: float = 0.5,
+    render_fraction: float = 0.5,
     near_photographs: float = 0.5,
     rotation: float | None = None,
     size: int = 128,
@@ -894,11 +894,11 @@ def train_detector(
     steps: int = 8000,
     batch: int = 4,
     learning_rate: float = 0.002,
-    encoder_share: float = 0.3,
+    encoder_rate: float = 0.3,
     frozen_stages: int = 2,
     size: int = 320,
-    photograph_share: float = 0.45,
-    render_share: float = 0.4,
+    photograph_fraction: float = 0.45,
+    render_fraction: float = 0.4,
     rotation: float | None = None,
     longest_side: int = 640,
     threshold: float = 0.4,

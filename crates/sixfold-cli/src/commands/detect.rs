@@ -66,7 +66,7 @@ pub(crate) fn run(a: &DetectArguments) -> Result<Outcome> {
         threshold: a.threshold.unwrap_or(default),
         overlap: a.overlap,
         per_class: a.per_object,
-        most: a.most,
+        max_detections: a.max_detections,
         masks: !a.no_masks,
     };
     options.check().map_err(|message| anyhow!(message))?;
@@ -110,7 +110,7 @@ fn run_options(a: &DetectArguments) -> RunOptions {
     options.add("threshold", &format!("{threshold:?}"));
     options.add("overlap", &overlap.to_string());
     options.add("per-object", &per_object.to_string());
-    options.add("most", &most.to_string());
+    options.add("max_detections", &max_detections.to_string());
     options.add("no-masks", &no_masks.to_string());
     options
 }

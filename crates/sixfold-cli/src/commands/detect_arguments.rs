@@ -48,7 +48,7 @@ pub(crate) struct DetectArguments {
     pub per_object: usize,
     /// Maximum number of detections in an image
     #[arg(long, value_name = "N", default_value = "100")]
-    pub most: usize,
+    pub max_detections: usize,
     /// Boxes only
     #[arg(long)]
     pub no_masks: bool,

@@ -44,9 +44,9 @@ fn experience_is_stored_shown_used_merged_exported_and_forgotten() {
             .expect(0)
             .json();
     assert_eq!(found["method"], "antipodal and dgcm");
-    let share = |grasp: &serde_json::Value| grasp["experience"]["share"].as_f64().unwrap();
+    let agreement = |grasp: &serde_json::Value| grasp["experience"]["agreement"].as_f64().unwrap();
     assert!(
-        found["grasps"].as_array().unwrap().iter().any(|g| share(g) > 0.0),
+        found["grasps"].as_array().unwrap().iter().any(|g| agreement(g) > 0.0),
         "the object itself is stored: {found}"
     );
     let part = format!("{VIEW} --experiences a.db --weights w.safetensors --part");
@@ -55,7 +55,7 @@ fn experience_is_stored_shown_used_merged_exported_and_forgotten() {
     let kinds = ["geometry", "experience"];
     assert!(grasps.iter().all(|g| kinds.contains(&g["experience"]["kind"].as_str().unwrap())));
     // The transferred grasp, or one of the planner's within 5 cm and 15 degrees of it.
-    assert!(grasps.iter().any(|g| share(g) > 0.0), "what was stored is among them: {handle}");
+    assert!(grasps.iter().any(|g| agreement(g) > 0.0), "what was stored is among them: {handle}");
     let lid = sixfold(path, &format!("{part} lid")).expect(1);
     assert!(lid.stderr.contains("no experience on a part named lid"), "{}", lid.stderr);
 

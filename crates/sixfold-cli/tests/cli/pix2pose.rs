@@ -12,7 +12,7 @@ use crate::support::*;
 /// Trains a small network on object 1 for a number of steps, on the three images of the tiny dataset.
 fn train(steps: usize) -> String {
     format!(
-        "train pix2pose --dataset tiny --ids 1 --size 64 --per-object 4 --rotation 0 --render-share 0 --steps {steps} --out trained"
+        "train pix2pose --dataset tiny --ids 1 --size 64 --per-object 4 --rotation 0 --render-fraction 0 --steps {steps} --out trained"
     )
 }
 

@@ -29,7 +29,7 @@ fn pix2pose_trains_and_estimates_as_published() {
     // The compact network, trained briefly, in the published form of estimation: no pose is aligned with the image.
     sixfold(
         dir,
-        "train pix2pose --dataset tiny --ids 1 --size 64 --per-object 4 --render-share 0 --steps 120 --out ours",
+        "train pix2pose --dataset tiny --ids 1 --size 64 --per-object 4 --render-fraction 0 --steps 120 --out ours",
     )
     .expect(0);
     let targets =

@@ -319,9 +319,9 @@ pub fn replace(file: &Path, from: &str, to: &str) {
 }
 
 /// Truncates a file to this fraction of its length.
-pub fn truncate(file: &Path, share: f64) {
+pub fn truncate(file: &Path, fraction: f64) {
     let bytes = std::fs::read(file).unwrap();
-    std::fs::write(file, &bytes[..(share * bytes.len() as f64) as usize]).unwrap();
+    std::fs::write(file, &bytes[..(fraction * bytes.len() as f64) as usize]).unwrap();
 }
 
 /// Lists the images of a dataset as photographs of object 1 with poses, depth and masks: `photographs.json` beside it, for `sixfold

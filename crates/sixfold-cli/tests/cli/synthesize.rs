@@ -80,7 +80,7 @@ fn a_training_set_of_new_views() {
     fails(tiny.path(), &format!("{} --seed 4 --with-photographs", few("new")), &["another seed", "--out"]);
 
     // A training can use it directly.
-    let train = "train pix2pose --dataset new --split train_nol --render-share 0 --size 64 --steps 2 --out trained --json";
+    let train = "train pix2pose --dataset new --split train_nol --render-fraction 0 --size 64 --steps 2 --out trained --json";
     let trained = sixfold(tiny.path(), train).expect(0).json();
     assert_eq!(trained["photographs"], 18);
 }

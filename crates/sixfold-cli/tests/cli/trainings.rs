@@ -7,7 +7,7 @@ use sixfold_mesh::{PlyFormat, Unit, read_mesh, write_ply};
 use crate::support::*;
 
 const PIX2POSE: &str =
-    "train pix2pose --dataset tiny --size 64 --per-object 1 --render-share 0 --steps 2 --out trained";
+    "train pix2pose --dataset tiny --size 64 --per-object 1 --render-fraction 0 --steps 2 --out trained";
 const DETECTOR: &str = "train detector --dataset tiny --size 96 --batch 1 --steps 2 --out trained";
 
 /// Replaces a file of the dataset while `run` runs.
@@ -149,14 +149,14 @@ fn options_that_no_training_can_have() {
             without(&p, "--steps") + " --steps 18446744073709551615",
             "--steps: found 18446744073709551615, expected at most",
         ),
-        (without(&p, "--render-share") + " --render-share nan", "--render-share: found NaN"),
+        (without(&p, "--render-fraction") + " --render-fraction nan", "--render-fraction: found NaN"),
         (format!("{p} --near-photographs nan"), "--near-photographs: found NaN"),
         (format!("{p} --learning-rate nan"), "--learning-rate: found NaN"),
         (format!("{p} --learning-rate inf"), "--learning-rate: found inf"),
         (format!("{p} --rotation nan"), "found nan, expected degrees from 0 to 180"),
         (format!("{d} --threshold nan"), "--threshold: found NaN"),
-        (format!("{d} --encoder-share nan"), "--encoder-share: found NaN"),
-        (format!("{d} --photograph-share nan"), "--photograph-share: found NaN"),
+        (format!("{d} --encoder-rate nan"), "--encoder-rate: found NaN"),
+        (format!("{d} --photograph-fraction nan"), "--photograph-fraction: found NaN"),
         (without(&d, "--size") + " --size 50", "--size: found 50, expected a multiple of 32"),
         (without(&d, "--steps") + " --steps 0", "--steps: found 0, expected 1 or more"),
         ("train nol --out trained --steps 0".to_owned(), "--steps: found 0, expected 1 or more"),

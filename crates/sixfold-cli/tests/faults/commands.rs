@@ -125,7 +125,7 @@ rows! {
     detect_dataset: dataset_and_networks, ["found.json", "pictures"], None,
         "detect --weights detector.safetensors --dataset tiny --threshold 0 --per-object 2 --out found.json --overlays pictures";
     train_pix2pose: dataset, ["out"], None,
-        "train pix2pose --dataset tiny --ids 1 --size 64 --per-object 4 --rotation 0 --render-share 0 --steps 3 --out out";
+        "train pix2pose --dataset tiny --ids 1 --size 64 --per-object 4 --rotation 0 --render-fraction 0 --steps 3 --out out";
     train_detector: dataset, ["out"], None,
         "train detector --dataset tiny --ids 1 --size 96 --batch 2 --steps 3 --out out";
     train_views: dataset, ["out"], None, "train views --steps 3 --batch 1 --out out";

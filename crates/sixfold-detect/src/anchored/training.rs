@@ -354,7 +354,7 @@ impl Training for AnchoredTraining {
             of_encoder.add(&encoder, part.encoder);
             of_rest.add(network, part.rest);
         }
-        let (encoder_rate, gradients) = (rate * self.options.encoder_share, of_encoder.into_gradients());
+        let (encoder_rate, gradients) = (rate * self.options.encoder_rate, of_encoder.into_gradients());
         match self.config.encoder {
             EncoderKind::ResNet50 => {
                 self.learner.step_part(encoder_rate, gradients, |network| &mut network.backbone_mut().body);

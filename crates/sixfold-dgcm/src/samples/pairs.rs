@@ -138,9 +138,9 @@ fn block(
         let (x, y) = (usize::from(p.index) % side, usize::from(p.index) / side);
         (x0, y0, x1, y1) = (x0.min(x), y0.min(y), x1.max(x + 1), y1.max(y + 1));
     }
-    let share = options.occlusion * random.random::<f64>();
+    let fraction = options.occlusion * random.random::<f64>();
     let from = random.random_range(0..4);
-    let depth = |low: usize, high: usize| (share * high.saturating_sub(low) as f64).round() as usize;
+    let depth = |low: usize, high: usize| (fraction * high.saturating_sub(low) as f64).round() as usize;
     let (dx, dy) = (depth(x0, x1), depth(y0, y1));
     move |index| {
         let (x, y) = (index % side, index / side);

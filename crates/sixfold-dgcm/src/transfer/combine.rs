@@ -370,7 +370,7 @@ mod tests {
                 let description = GraspDescription { overlap, ..fitter.describe(&centre) };
                 Attempt {
                     description,
-                    share: 0.0,
+                    agreement: 0.0,
                     transferred: false,
                     held: overlap > 0.03,
                     gripper: gripper.name.clone(),

@@ -435,7 +435,7 @@ mod tests {
         let centre = centre_between_pads(&grasp(-0.04).camera_from_gripper);
         let grasp_centres = vec![(centre + Vec3::z() * 0.015, 0.75), (centre + Vec3::x() * 0.3, 0.25)];
         let found = Proposals { grasp_centres, ..found };
-        let share = 0.75 * (-0.5f64 * (0.015f64 / GRASP_CENTRE_SCALE).powi(2)).exp();
-        assert!((found.holds_the_same(&grasp(-0.04), &gripper) - 0.8 * share).abs() < 1e-6);
+        let fraction = 0.75 * (-0.5f64 * (0.015f64 / GRASP_CENTRE_SCALE).powi(2)).exp();
+        assert!((found.holds_the_same(&grasp(-0.04), &gripper) - 0.8 * fraction).abs() < 1e-6);
     }
 }

@@ -126,7 +126,7 @@ pub fn attempt(number: u32) -> Attempt {
         GraspDescription { quality, overlap: 0.03, lever: n / 700.0, above_middle: -0.01, table_room: None };
     Attempt {
         description,
-        share: n / 17.0,
+        agreement: n / 17.0,
         transferred: number % 2 == 1,
         held: number.is_multiple_of(3),
         gripper: "jaws-85".to_owned(),
@@ -168,7 +168,7 @@ fn records_are_kept(store: &mut dyn ExperienceStore) {
     assert_eq!(store.attempts(0).unwrap(), [(rows[1].0, attempt(2))]);
     // One thing in it is wrong.
     let mut wrong = attempt(3);
-    wrong.share = f64::INFINITY;
+    wrong.agreement = f64::INFINITY;
     assert!(store.add_record(&TaskRecord { attempts: &[attempt(4), wrong], ..record }).is_err());
     assert_eq!(store.attempts(0).unwrap().len(), 1);
 }

@@ -408,11 +408,12 @@ fn overlap(mask: &[u32], visible: &[bool]) -> f64 {
 fn row(key: &'static str, title: &'static str, measured: &[Measured]) -> Row {
     let outcomes: Vec<&Outcomes> = measured.iter().filter_map(|m| m.get(key)).flatten().collect();
     let score = |of: &[&Outcomes]| {
-        let share = |count: usize| count as f64 / of.len().max(1) as f64;
+        let fraction = |count: usize| count as f64 / of.len().max(1) as f64;
         Score {
             targets: of.len(),
-            iou: (key != PPF.0).then(|| share(of.iter().filter(|o| o.iou.is_some_and(|v| v > 0.5)).count())),
-            add_s: share(of.iter().filter(|o| o.error.is_some_and(|e| e < 0.1)).count()),
+            iou: (key != PPF.0)
+                .then(|| fraction(of.iter().filter(|o| o.iou.is_some_and(|v| v > 0.5)).count())),
+            add_s: fraction(of.iter().filter(|o| o.error.is_some_and(|e| e < 0.1)).count()),
         }
     };
     let mut by_object: BTreeMap<u32, Vec<&Outcomes>> = BTreeMap::new();

@@ -40,7 +40,7 @@ pub fn pix2pose(folder: &Path) {
         steps: Some(3),
         per_object: Some(4),
         rotation: 0.0,
-        render_share: 0.0,
+        render_fraction: 0.0,
         size: 64,
         ..Pix2PoseRecipe::default()
     };

@@ -88,8 +88,8 @@ impl RefinementState<'_, '_> {
         // With a separate camera for every source, the single place of an object does not constrain its poses.
         let apart = pairs.iter().enumerate().map(|(k, [_, object])| [k, *object]).collect();
         let mut arrangement = Arrangement::new(apart, &given, given.len(), self.objects.len());
-        let share = if judge { 0.5 } else { 1.0 };
-        if !self.align(&mut arrangement, &each, 0, [0.0, share]) || !judge {
+        let fraction = if judge { 0.5 } else { 1.0 };
+        if !self.align(&mut arrangement, &each, 0, [0.0, fraction]) || !judge {
             return Standing { places: each, still: false, disagreement };
         }
         let better: Vec<Pose> = self.working.iter().map(|w| w.pose).collect();
@@ -106,7 +106,7 @@ impl RefinementState<'_, '_> {
                 places[*object].insert(*place);
             }
             let places: Vec<Vec<usize>> = places.into_iter().map(|of| of.into_iter().collect()).collect();
-            self.align(&mut arrangement, &places, AGAIN, [share, 1.0]);
+            self.align(&mut arrangement, &places, AGAIN, [fraction, 1.0]);
             return Standing { places, still: false, disagreement };
         }
         Standing { places: each, still: false, disagreement }

@@ -80,12 +80,10 @@ pub struct ViewBatchOptions {
     #[serde(default = "one", skip_serializing_if = "is_one")]
     pub min_sources: usize,
     /// Maximum number of sources of a sample; a step has from `min_sources` to this many, uniformly distributed.
-    #[serde(rename = "most_sources")]
     pub max_sources: usize,
     /// Sources in a step at the smallest side; fewer at a larger one.
     pub sources: usize,
     /// Maximum number of samples in a step.
-    #[serde(rename = "most_samples")]
     pub max_samples: usize,
 }
 

@@ -147,9 +147,9 @@ fn seen_from(direction: &Vec3, options: &ViewSampleOptions, random: &mut Random)
     Pose::new(roll * rotation, aside * distance)
 }
 
-/// A pose with the errors of table 4.1, scaled by `share`.
-fn perturbed(pose: &Pose, options: &ViewSampleOptions, share: f64, random: &mut Random) -> Pose {
-    let mut each = |most: f64| Vec3::from_fn(|_, _| share * most * (2.0 * random.random::<f64>() - 1.0));
+/// A pose with the errors of table 4.1, scaled by `fraction`.
+fn perturbed(pose: &Pose, options: &ViewSampleOptions, fraction: f64, random: &mut Random) -> Pose {
+    let mut each = |most: f64| Vec3::from_fn(|_, _| fraction * most * (2.0 * random.random::<f64>() - 1.0));
     let (shift, angles) = (each(options.translation), each(options.rotation));
     let turn = UnitQuaternion::from_euler_angles(angles.x, angles.y, angles.z);
     Pose::new(turn * pose.rotation(), pose.translation() + shift)
@@ -218,8 +218,8 @@ mod tests {
                 all += projection.cosines.len();
             }
         }
-        let share = seen as f64 / all as f64;
-        assert!((0.4..0.95).contains(&share), "{share}");
+        let fraction = seen as f64 / all as f64;
+        assert!((0.4..0.95).contains(&fraction), "{fraction}");
     }
 
     #[test]

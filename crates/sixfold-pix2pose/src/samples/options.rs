@@ -17,7 +17,7 @@ pub struct SampleOptions {
     /// Side of coordinates and masks, pixels; `None`: that of the input.
     pub target_size: Option<usize>,
     /// Fraction of rendered samples of an object that has photographs and can be rendered, 0..1.
-    pub render_share: f32,
+    pub render_fraction: f32,
     /// Ratio of the crop's side to the longer side of the object's box (dissertation: 1.5).
     pub crop_factor: f64,
     /// Largest shift of the crop's centre, as a fraction of the box.
@@ -90,7 +90,7 @@ impl Default for SampleOptions {
         SampleOptions {
             size: 128,
             target_size: None,
-            render_share: 0.5,
+            render_fraction: 0.5,
             crop_factor: 1.5,
             centre_jitter: 0.07,
             size_jitter: 0.2,
@@ -130,7 +130,7 @@ impl SampleOptions {
     /// replaced by the background; whole batches of `batch` samples alternate between the first and the second stage.
     pub fn published(batch: u64) -> Self {
         SampleOptions {
-            render_share: 0.0,
+            render_fraction: 0.0,
             visible_box_probability: 0.0,
             cut_probability: 0.0,
             rotation: FRAC_PI_4,
@@ -164,10 +164,10 @@ impl SampleOptions {
 
     /// Whether sample `number` imitates the second stage.
     pub(super) fn is_second_stage(&self, number: u64, random: &mut Random) -> bool {
-        let share = f64::from(self.second_stage_fraction);
-        let Some(block) = self.second_stage_block else { return random.random::<f64>() < share };
+        let fraction = f64::from(self.second_stage_fraction);
+        let Some(block) = self.second_stage_block else { return random.random::<f64>() < fraction };
         let block = (number / block.max(1)) as f64;
-        ((block + 1.0) * share).floor() > (block * share).floor()
+        ((block + 1.0) * fraction).floor() > (block * fraction).floor()
     }
 
     /// Tests every field.
@@ -183,7 +183,7 @@ impl SampleOptions {
         }
         let probability = "a number between 0 and 1";
         for (field, value) in [
-            ("render_share", self.render_share),
+            ("render_fraction", self.render_fraction),
             ("visible_box_probability", self.visible_box_probability),
             ("cut_probability", self.cut_probability),
             ("keep_background_probability", self.keep_background_probability),

@@ -143,7 +143,7 @@ impl SampleSource {
         let mut random = stream(seed ^ (object_index as u64 + 1).wrapping_mul(0x9e37_79b9_7f4a_7c15), number);
         let can_render = object.drawn.colored || options.random_color_probability > 0.0;
         let rendered =
-            can_render && (object.real.is_empty() || random.random::<f32>() < options.render_share);
+            can_render && (object.real.is_empty() || random.random::<f32>() < options.render_fraction);
         let scenery =
             Scenery { options, backgrounds: &self.backgrounds, cutouts: &self.cutouts, object_index };
         let (mut composition, coordinates, object_mask, hidden) = if rendered {

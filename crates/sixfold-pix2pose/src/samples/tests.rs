@@ -147,7 +147,7 @@ fn inner(sample: &Sample, target: usize, margin: usize) -> Vec<(usize, usize)> {
 
 #[test]
 fn rotated_crops_match_their_target_coordinates() {
-    let source = source(SampleOptions { render_share: 0.0, ..plain() });
+    let source = source(SampleOptions { render_fraction: 0.0, ..plain() });
     let (mut count, mut worst, mut sum) = (0, 0.0f32, 0.0);
     for number in 0..60 {
         let sample = source.sample(0, 3, number);
@@ -170,7 +170,7 @@ fn rotated_crops_match_their_target_coordinates() {
 
 #[test]
 fn renders_and_their_targets_cover_the_same_pixels() {
-    let source = source(SampleOptions { render_share: 1.0, centre_jitter: 0.3, ..plain() });
+    let source = source(SampleOptions { render_fraction: 1.0, centre_jitter: 0.3, ..plain() });
     for number in 0..40 {
         let sample = source.sample(0, 5, number);
         let (mut wrong, mut all) = (0, 0);
@@ -198,7 +198,7 @@ fn renders_and_their_targets_cover_the_same_pixels() {
 
 #[test]
 fn render_colors_follow_the_coordinates() {
-    let source = source(SampleOptions { render_share: 1.0, ..plain() });
+    let source = source(SampleOptions { render_fraction: 1.0, ..plain() });
     // Correlation of each colour with its coordinate, over all samples: the light varies, but the order of colours does not.
     let mut sums = [[0.0f64; 5]; 3];
     let mut count = 0.0;
@@ -249,23 +249,23 @@ fn a_coordinate_projects_to_its_pixel_and_is_on_the_surface() {
 fn occluders_change_what_is_visible_and_nothing_else() {
     let free = source(plain());
     let hidden = source(SampleOptions { occlusion_probability: 1.0, occlusion: [0.2, 0.5], ..plain() });
-    let mut share = 0.0;
+    let mut fraction = 0.0;
     for number in 0..60 {
         let (a, b) = (free.sample(0, 9, number), hidden.sample(0, 9, number));
         assert!(a.coordinates == b.coordinates && a.object == b.object);
         assert!(a.visible.iter().zip(&b.visible).all(|(a, b)| b <= a));
-        share += b.visible.iter().sum::<f32>() / a.visible.iter().sum::<f32>() / 60.0;
+        fraction += b.visible.iter().sum::<f32>() / a.visible.iter().sum::<f32>() / 60.0;
     }
     // The mean visible fraction when between 0.2 and 0.5 are hidden.
-    assert!((share - 0.65).abs() < 0.06, "{share}");
+    assert!((fraction - 0.65).abs() < 0.06, "{fraction}");
 }
 
 #[test]
 fn a_truncated_object_fills_the_crop_like_a_whole_one() {
     let still = SampleOptions { centre_jitter: 0.0, size_jitter: 0.0, ..plain() };
-    let whole = source(SampleOptions { render_share: 1.0, visible_box_probability: 1.0, ..still.clone() });
+    let whole = source(SampleOptions { render_fraction: 1.0, visible_box_probability: 1.0, ..still.clone() });
     let cut = source(SampleOptions {
-        render_share: 1.0,
+        render_fraction: 1.0,
         visible_box_probability: 1.0,
         cut_probability: 1.0,
         cut: [0.3, 0.3],
@@ -371,7 +371,7 @@ fn a_continuous_symmetry_has_one_target() {
     let symmetry = ContinuousSymmetry { axis: Vec3::z(), offset: Vec3::new(0.01, -0.02, 0.0) };
     turning.info.symmetries_continuous.push(symmetry);
     let info = turning.info.clone();
-    let options = SampleOptions { render_share: 0.0, centre_jitter: 0.0, size_jitter: 0.0, ..plain() };
+    let options = SampleOptions { render_fraction: 0.0, centre_jitter: 0.0, size_jitter: 0.0, ..plain() };
     let options = SampleOptions { visible_box_probability: 1.0, rotation: 0.0, ..options };
     let make = |pose| {
         // The same photograph and mask, the pose rotated about the axis.
@@ -420,7 +420,7 @@ fn errors_explain_why_training_is_impossible() {
         (SampleOptions { occlusion: [0.5, 0.2], ..default() }, "occlusion"),
         (SampleOptions { cut: [0.1, 0.95], ..default() }, "cut"),
         (SampleOptions { cut_probability: 1.5, ..default() }, "cut_probability"),
-        (SampleOptions { render_share: f32::NAN, ..default() }, "render_share"),
+        (SampleOptions { render_fraction: f32::NAN, ..default() }, "render_fraction"),
         (SampleOptions { crop_factor: 0.0, ..default() }, "crop_factor"),
         (SampleOptions { distance: Some([0.0, 1.0]), ..default() }, "distance"),
     ] {
@@ -484,7 +484,7 @@ fn a_texture_is_rendered_also_on_a_simplified_mesh() {
 fn published_samples_are_photographs_on_backgrounds_with_alternating_stages() {
     let published = SampleOptions::published(50);
     assert_eq!(published.color, sixfold_synth::augment::ColorAugmentation::table_3_2());
-    assert_eq!((published.second_stage_block, published.render_share), (Some(50), 0.0));
+    assert_eq!((published.second_stage_block, published.render_fraction), (Some(50), 0.0));
     assert_eq!((published.keep_background_probability, published.cut_probability), (0.0, 0.0));
     assert!((published.rotation.to_degrees() - 45.0).abs() < 1e-4);
     assert!(published.check().is_ok());
@@ -505,8 +505,8 @@ fn published_samples_are_photographs_on_backgrounds_with_alternating_stages() {
         let s = source.sample(0, 3, number);
         let pixels = s.object.len();
         let hidden: Vec<usize> = (0..pixels).filter(|i| s.object[*i] > 0.5 && s.visible[*i] < 0.5).collect();
-        let share = hidden.len() as f32 / s.object.iter().sum::<f32>();
-        assert!((0.2..0.6).contains(&share), "{number}: {share}");
+        let fraction = hidden.len() as f32 / s.object.iter().sum::<f32>();
+        assert!((0.2..0.6).contains(&fraction), "{number}: {fraction}");
         let grey = |i: &usize| (0..3).all(|c| (s.rgb[c * pixels + i] - s.rgb[c * pixels]).abs() < 0.03);
         let wrong = hidden.iter().filter(|i| !grey(i)).count();
         // Pixels along the occluder's border mix both.

@@ -62,7 +62,7 @@ struct FromExperience {
     /// Whether a difference in size was explained by a scale or by a rotation.
     hypothesis: Option<&'static str>,
     /// The fraction of experience that agrees with the grasp.
-    share: f64,
+    agreement: f64,
 }
 
 impl Proposed {
@@ -107,7 +107,7 @@ pub fn of_both(planner: &Planner, grasps: &sixfold_dgcm::transfer::RankedGrasps)
             id: proposal.map(|p| p.from.experience),
             distance: proposal.map(|p| p.from.distance),
             hypothesis: proposal.map(|p| p.hypothesis.name()),
-            share: r.experience,
+            agreement: r.experience,
         };
         let made = Proposed { experience: Some(experience), ..Proposed::new(&r.grasp, r.score, r.members) };
         match (planner, r.kind) {

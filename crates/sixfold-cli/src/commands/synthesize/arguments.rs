@@ -105,7 +105,7 @@ pub(crate) struct SynthesizeArguments {
     pub per_view: usize,
     /// Minimum visible fraction of the object; other photographs are left out
     #[arg(long, value_name = "FRACTION", default_value = "0.5")]
-    pub least_visible: f64,
+    pub min_visible: f64,
     /// Trained detector that makes masks for photographs without masks (default: masks rendered from the poses, without occlusion)
     #[arg(long, value_name = "FILE.safetensors")]
     pub detector: Option<PathBuf>,
@@ -160,7 +160,7 @@ pub(crate) struct SynthesizeArguments {
 pub(crate) const AFTER_HELP: &str = "Examples:\n  \
     sixfold synthesize --dataset lmo --frames frames.json --out out/nol\n  \
     sixfold synthesize --photographs mug/photographs.json --out out/mug\n  \
-    sixfold train pix2pose --dataset out/nol --split train_nol --render-share 0 --out out/mug-model\n\n\
+    sixfold train pix2pose --dataset out/nol --split train_nol --render-fraction 0 --out out/mug-model\n\n\
     A file for --photographs (paths are relative to it; poses as in BOP, object to camera, millimetres; mask may be left out):\n  \
     {\"mesh\": \"mug.ply\", \"unit\": \"mm\", \"photographs\": [{\"image\": \"1.png\", \"camera\": \"camera.json\",\n    \
     \"cam_R_m2c\": [1,0,0, 0,1,0, 0,0,1], \"cam_t_m2c\": [0, 0, 600], \"mask\": \"1-mask.png\"}]}\n\n\
@@ -194,7 +194,7 @@ impl SynthesizeArguments {
         }
         in_range("--sources", self.sources, 1..=1000)?;
         in_range("--per-view", self.per_view, 1..=1000)?;
-        in_range("--least-visible", self.least_visible, 0.0..=1.0)?;
+        in_range("--min-visible", self.min_visible, 0.0..=1.0)?;
         without_duplicates("--ids", &self.ids)?;
         if self.weights.is_some() && self.weighting != WeightingKind::Network {
             bail!("--weights belongs to --weighting network");
@@ -271,7 +271,7 @@ impl SynthesizeArguments {
             "version": env!("CARGO_PKG_VERSION"),
             "dataset": self.dataset, "split": self.split, "models": self.models, "frames": self.frames, "ids": self.ids,
             "photographs": self.photographs, "new_split": self.new_split, "sources": self.sources,
-            "per_view": self.per_view, "least_visible": self.least_visible,
+            "per_view": self.per_view, "min_visible": self.min_visible,
             "weighting": format!("{:?}", self.weighting), "weights": self.weights,
             "detector": self.detector, "no_refine": self.no_refine, "scene": format!("{:?}", self.scene),
             "rough": self.rough, "disturb": self.disturb, "step": self.step, "elevation": self.elevation,

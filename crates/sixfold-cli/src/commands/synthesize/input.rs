@@ -20,7 +20,7 @@ pub(super) fn read(a: &SynthesizeArguments) -> Result<RoughImages> {
         None => Ok(vec![]),
     };
     let options = RoughImageOptions {
-        min_visibility: a.least_visible,
+        min_visibility: a.min_visible,
         disturb: a.disturb_reach()?,
         seed: a.seed,
         detect: if detector.is_some() { Some(&detect) } else { None },

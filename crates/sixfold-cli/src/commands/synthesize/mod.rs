@@ -25,7 +25,7 @@ pub(crate) fn run(a: &SynthesizeArguments) -> Result<Outcome> {
     let folder = DatasetFolder::take(&a.out, "synthesize", a.deciding(), &inputs)?;
     let images = input::read(a)?;
     if images.objects.is_empty() {
-        bail!("no photograph shows any of the objects; choose other --frames or a lower --least-visible");
+        bail!("no photograph shows any of the objects; choose other --frames or a lower --min-visible");
     }
     folder.begin(&input::contents(a, &images)?)?;
     let network;

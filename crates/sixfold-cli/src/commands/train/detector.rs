@@ -50,8 +50,8 @@ pub(crate) struct TrainDetectorArguments {
     #[arg(long, value_name = "RATE", default_value_t = default().learning_rate)]
     pub learning_rate: f64,
     /// Learning rate of the pretrained encoder, as a fraction of --learning-rate, 0 to 1
-    #[arg(long, value_name = "FRACTION", default_value_t = default().encoder_share)]
-    pub encoder_share: f64,
+    #[arg(long, value_name = "FRACTION", default_value_t = default().encoder_rate)]
+    pub encoder_rate: f64,
     /// Number of the five stages of the ImageNet encoder that are not trained
     #[arg(long, value_name = "N", default_value_t = default().frozen_stages)]
     pub frozen_stages: usize,
@@ -62,10 +62,10 @@ pub(crate) struct TrainDetectorArguments {
     /// Side of the training images in pixels, a multiple of 32 (retinanet: 128)
     #[arg(long, value_name = "PIXELS", default_value_t = default().size)]
     pub size: usize,
-    #[arg(long, value_name = "FRACTION", help = presets(PHOTOGRAPHS, default().photograph_share, published().photograph_share))]
-    pub photograph_share: Option<f32>,
-    #[arg(long, value_name = "FRACTION", help = presets(RENDERS, default().render_share, published().render_share))]
-    pub render_share: Option<f32>,
+    #[arg(long, value_name = "FRACTION", help = presets(PHOTOGRAPHS, default().photograph_fraction, published().photograph_fraction))]
+    pub photograph_fraction: Option<f32>,
+    #[arg(long, value_name = "FRACTION", help = presets(RENDERS, default().render_fraction, published().render_fraction))]
+    pub render_fraction: Option<f32>,
     /// Largest rotation in the image plane, degrees
     #[arg(long, value_name = "DEGREES", default_value_t = Degrees { radians: default().rotation })]
     pub rotation: Degrees,
@@ -98,12 +98,12 @@ impl TrainDetectorArguments {
             steps: self.steps,
             batch: self.batch,
             learning_rate: self.learning_rate,
-            encoder_share: self.encoder_share,
+            encoder_rate: self.encoder_rate,
             frozen_stages: self.frozen_stages,
             encoder: self.encoder.clone(),
             size: self.size,
-            photograph_share: self.photograph_share.unwrap_or(default.photograph_share),
-            render_share: self.render_share.unwrap_or(default.render_share),
+            photograph_fraction: self.photograph_fraction.unwrap_or(default.photograph_fraction),
+            render_fraction: self.render_fraction.unwrap_or(default.render_fraction),
             rotation: self.rotation.radians,
             mesh_colors: !self.no_mesh_colors,
             longest_side: self.longest_side,

@@ -51,8 +51,8 @@ fn network_help() -> String {
     presets("Network to train", ours, published)
 }
 
-fn render_share_help() -> String {
-    let (ours, published) = (default().render_share, Pix2PoseRecipe::published().render_share);
+fn render_fraction_help() -> String {
+    let (ours, published) = (default().render_fraction, Pix2PoseRecipe::published().render_fraction);
     presets("Fraction of renders among the images, 0 to 1", ours, published)
 }
 
@@ -119,8 +119,8 @@ pub(crate) struct TrainPix2PoseArguments {
     /// Number of the five stages of the ImageNet encoder that are not trained
     #[arg(long, value_name = "N", default_value_t = default().frozen_stages)]
     pub frozen_stages: usize,
-    #[arg(long, value_name = "FRACTION", help = render_share_help())]
-    pub render_share: Option<f32>,
+    #[arg(long, value_name = "FRACTION", help = render_fraction_help())]
+    pub render_fraction: Option<f32>,
     /// Fraction of renders with a pose near that of a photograph, 0 to 1; the others are from any direction above
     #[arg(long, value_name = "FRACTION", default_value_t = default().near_photographs)]
     pub near_photographs: f32,
@@ -170,7 +170,7 @@ impl TrainPix2PoseArguments {
             adversarial: self.adversarial.then_some(true).or(self.no_adversarial.then_some(false)),
             encoder: self.encoder.clone(),
             frozen_stages: self.frozen_stages,
-            render_share: self.render_share.unwrap_or(default.render_share),
+            render_fraction: self.render_fraction.unwrap_or(default.render_fraction),
             near_photographs: self.near_photographs,
             rotation: self.rotation.radians,
             size: self.size,

@@ -85,9 +85,9 @@ fn the_preset_published_asks_for_the_published_recipes_and_other_options_still_c
     }
     let recipe = recipe!(
         Pix2pose,
-        "pix2pose --object mug.ply --preset published,lmo --network resnet50 --render-share 0.25"
+        "pix2pose --object mug.ply --preset published,lmo --network resnet50 --render-fraction 0.25"
     );
-    assert!(recipe.published && recipe.render_share == 0.25);
+    assert!(recipe.published && recipe.render_fraction == 0.25);
     assert_eq!(recipe.network, NetworkKind::ResNet50);
     assert_eq!(recipe.preset, Some(sixfold_pix2pose::preset::Preset::Lmo));
     let options = recipe!(Nol, "nol --loss gan").options();

@@ -64,7 +64,7 @@ fn row(given: Given, searches: &[Search]) -> Option<Row> {
     if of.is_empty() {
         return None;
     }
-    let share = |a: usize, b: usize| if b == 0 { 0.0 } else { a as f64 / b as f64 };
+    let fraction = |a: usize, b: usize| if b == 0 { 0.0 } else { a as f64 / b as f64 };
     // The best pose of each search: its probability and whether it is right.
     let best: Vec<(bool, f64, bool)> =
         of.iter().filter_map(|s| s.poses.first().map(|p| (s.present, p.probability, p.right))).collect();
@@ -85,15 +85,15 @@ fn row(given: Given, searches: &[Search]) -> Option<Row> {
         bin.probability /= bin.poses as f64;
         bin.right /= bin.poses as f64;
     }
-    let error = |b: &Bin| share(b.poses, best.len()) * (b.probability - b.right).abs();
+    let error = |b: &Bin| fraction(b.poses, best.len()) * (b.probability - b.right).abs();
     Some(Row {
         given,
         present,
-        found: share(right, present),
-        kept: share(reported_right, right),
-        precision: share(reported_right, reported.count()),
+        found: fraction(right, present),
+        kept: fraction(reported_right, right),
+        precision: fraction(reported_right, reported.count()),
         absent,
-        accepted: share(accepted, absent),
+        accepted: fraction(accepted, absent),
         expected_error: bins.iter().map(error).sum(),
         auc: auc(&best),
         seconds: of.iter().map(|s| s.seconds).sum::<f64>() / of.len() as f64,

@@ -346,11 +346,11 @@ impl Whole {
             for p in &self.curves {
                 let Some(column) = COUNTS.iter().position(|c| *c == p.count) else { continue };
                 match lines.iter_mut().find(|l| l.class == p.class && l.all == p.all_classes) {
-                    Some(line) => line.shares[column] = p.within[k],
+                    Some(line) => line.fractions[column] = p.within[k],
                     None => {
-                        let mut shares = [0.0; COUNTS.len()];
-                        shares[column] = p.within[k];
-                        lines.push(Line { class: p.class.clone(), all: p.all_classes, shares });
+                        let mut fractions = [0.0; COUNTS.len()];
+                        fractions[column] = p.within[k];
+                        lines.push(Line { class: p.class.clone(), all: p.all_classes, fractions });
                     }
                 }
             }
@@ -358,7 +358,7 @@ impl Whole {
             let title = format!("grasps within {name}");
             write_rgb(&folder.join(format!("experience-{tag}.png")), &pictures::curves(&title, &lines))?;
             let names: Vec<String> = instances.iter().map(short).collect();
-            let shares: Vec<Vec<Option<f64>>> = instances
+            let fractions: Vec<Vec<Option<f64>>> = instances
                 .iter()
                 .map(|a| {
                     let find = |b: &Instance| {
@@ -367,7 +367,7 @@ impl Whole {
                     instances.iter().map(find).collect()
                 })
                 .collect();
-            let picture = pictures::matrix(&title, &names, &shares);
+            let picture = pictures::matrix(&title, &names, &fractions);
             write_rgb(&folder.join(format!("between-objects-{tag}.png")), &picture)?;
         }
         let first: Vec<(&str, &Curve)> =

@@ -11,7 +11,7 @@ pub(super) struct Line {
     pub class: String,
     /// Whether experience of all classes is used, or only of this class.
     pub all: bool,
-    pub shares: [f64; COUNTS.len()],
+    pub fractions: [f64; COUNTS.len()],
 }
 
 /// Fractions against the number of experiences per object.
@@ -36,7 +36,7 @@ pub(super) fn curves(title: &str, lines: &[Line]) -> RgbImage {
             classes.len() - 1
         });
         let color = COLORS[number % COLORS.len()];
-        let at = |k: usize| (x(k), top + height * (1.0 - line.shares[k]));
+        let at = |k: usize| (x(k), top + height * (1.0 - line.fractions[k]));
         for k in 1..COUNTS.len() {
             let (from, to) = (at(k - 1), at(k));
             if line.all {
@@ -62,27 +62,27 @@ pub(super) fn curves(title: &str, lines: &[Line]) -> RgbImage {
 }
 
 /// Fractions for transfer from every object (rows) to every other (columns).
-pub(super) fn matrix(title: &str, names: &[String], shares: &[Vec<Option<f64>>]) -> RgbImage {
+pub(super) fn matrix(title: &str, names: &[String], fractions: &[Vec<Option<f64>>]) -> RgbImage {
     let cell = 46.0;
     let widest = names.iter().map(|n| text_width(n, 1.5)).fold(0.0, f64::max);
     let (left, top) = (widest + 24.0, widest + 44.0);
     let side = cell * names.len() as f64;
     let mut canvas = Canvas::new((left + side + 20.0) as usize, (top + side + 30.0) as usize);
     canvas.text(12.0, 12.0, 2.0, title, INK);
-    for (i, row) in shares.iter().enumerate() {
+    for (i, row) in fractions.iter().enumerate() {
         let y = top + cell * i as f64;
         canvas.text(12.0, y + 0.5 * cell - 5.0, 1.5, &names[i], INK);
         let x = left + cell * i as f64 + 0.5 * cell - 5.0;
         canvas.text_upwards(x, top - 8.0 - 0.5 * text_width(&names[i], 1.5), 1.5, &names[i], INK);
-        for (k, share) in row.iter().enumerate() {
+        for (k, fraction) in row.iter().enumerate() {
             let x = left + cell * k as f64;
-            let Some(share) = share else { continue };
+            let Some(fraction) = fraction else { continue };
             // White to blue.
-            let color =
-                [1.0 - 0.88 * share, 1.0 - 0.53 * share, 1.0 - 0.29 * share].map(|v| (255.0 * v) as u8);
+            let color = [1.0 - 0.88 * fraction, 1.0 - 0.53 * fraction, 1.0 - 0.29 * fraction]
+                .map(|v| (255.0 * v) as u8);
             canvas.rectangle(x + 1.0, y + 1.0, cell - 2.0, cell - 2.0, color);
-            let ink = if *share > 0.6 { [255; 3] } else { INK };
-            canvas.text(x + 6.0, y + 0.5 * cell - 6.0, 1.5, &format!("{share:.2}"), ink);
+            let ink = if *fraction > 0.6 { [255; 3] } else { INK };
+            canvas.text(x + 6.0, y + 0.5 * cell - 6.0, 1.5, &format!("{fraction:.2}"), ink);
         }
     }
     canvas.text(12.0, top + side + 10.0, 1.5, "rows: experience of; columns: grasp on", INK);

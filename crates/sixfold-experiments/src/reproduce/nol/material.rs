@@ -130,8 +130,8 @@ impl Material {
         let mut all = vec![];
         for (number, (frame, poses)) in self.sources.iter().zip(poses).enumerate() {
             let visible = self.visible(frame, poses);
-            for (index, ((object, truth), (share, mask))) in frame.truth.iter().zip(visible).enumerate() {
-                if share < MIN_VISIBILITY {
+            for (index, ((object, truth), (fraction, mask))) in frame.truth.iter().zip(visible).enumerate() {
+                if fraction < MIN_VISIBILITY {
                     continue;
                 }
                 let (image, pose) = (frame.image.clone(), poses[index]);
@@ -172,8 +172,8 @@ impl Material {
             if !frame.truth.iter().any(|(id, _)| *id == object) {
                 continue;
             }
-            for ((id, pose), (share, mask)) in frame.truth.iter().zip(self.visible(frame, &poses)) {
-                if *id == object && share >= MIN_TARGET_VISIBILITY {
+            for ((id, pose), (fraction, mask)) in frame.truth.iter().zip(self.visible(frame, &poses)) {
+                if *id == object && fraction >= MIN_TARGET_VISIBILITY {
                     let (id, image) = (frame.id.into(), frame.image.clone());
                     let photograph = PosedImage::of_frame(id, object, image, frame.camera, *pose)?;
                     all.push((frame.id, photograph.with_mask(&mask)?));

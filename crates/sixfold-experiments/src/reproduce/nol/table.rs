@@ -54,7 +54,7 @@ fn poses(out: &mut String, rows: &[PosesSummary]) {
         let a = &r.all;
         let seconds = r.seconds.map_or("-".to_owned(), |s| format!("{s:.0}"));
         let nearer = a.improved.filter(|_| r.seconds.is_some());
-        let nearer = nearer.map_or("-".to_owned(), |share| format!("{:.0} %", 100.0 * share));
+        let nearer = nearer.map_or("-".to_owned(), |fraction| format!("{:.0} %", 100.0 * fraction));
         let _ = writeln!(
             out,
             "| {} | {} | {:.2} | {:.2} | {:.2} | {:.2} | {nearer} | {} | {seconds} |",

@@ -63,7 +63,7 @@ pub(super) struct Row {
 pub(super) struct RightBoxes {
     /// Fraction of the targets whose best box has an intersection over union above one half with the visible
     /// ground truth's box.
-    pub share: f64,
+    pub fraction: f64,
     /// ADD(-S) below a tenth of the diameter over these targets alone.
     pub add_s: Option<f64>,
 }
@@ -133,7 +133,7 @@ impl Setting {
         match (detections, self.noise) {
             (Some(name), _) => name.to_owned(),
             (None, None) => "ground truth".to_string(),
-            (None, Some(share)) => format!("ground truth, noise {:.0} %", 100.0 * share),
+            (None, Some(fraction)) => format!("ground truth, noise {:.0} %", 100.0 * fraction),
         }
     }
 }
@@ -166,9 +166,9 @@ impl Bench {
                 let mine = boxes.get(&(*scene_id, *im_id, o.obj_id)).unwrap_or(&none);
                 for (number, (region, score)) in mine.iter().enumerate() {
                     let region = match setting.noise {
-                        Some(share) => moved(
+                        Some(fraction) => moved(
                             region,
-                            share,
+                            fraction,
                             [self.seed, (*scene_id).into(), (*im_id).into(), o.obj_id.into(), number as u64],
                         ),
                         None => *region,
@@ -227,10 +227,10 @@ impl Bench {
             best.is_some_and(|(found, _)| truth.iter().any(|(b, _)| overlap(found, b) > RIGHT_BOX))
         };
         let right: Vec<Target> = self.targets.iter().filter(overlaps).copied().collect();
-        let share = right.len() as f64 / self.targets.len().max(1) as f64;
+        let fraction = right.len() as f64 / self.targets.len().max(1) as f64;
         let options = EvalOptions { compute_vsd: false, ..EvalOptions::default() };
         let e = evaluate(&self.dataset, estimates, &right, &options, &())?;
-        Ok(RightBoxes { share, add_s: e.add_s_recall.get("mean").copied().flatten() })
+        Ok(RightBoxes { fraction, add_s: e.add_s_recall.get("mean").copied().flatten() })
     }
 
     /// A row of estimates.
@@ -312,12 +312,12 @@ fn half_black(image: &RgbImage, region: &Rect, side: u64) -> RgbImage {
     })
 }
 
-/// The box with centre and sides changed by up to the fraction `share` of its sides; the same box and seed
+/// The box with centre and sides changed by up to the fraction `fraction` of its sides; the same box and seed
 /// give the same result.
-fn moved(region: &Rect, share: f64, seed: [u64; 5]) -> Rect {
+fn moved(region: &Rect, fraction: f64, seed: [u64; 5]) -> Rect {
     let number = seed.iter().fold(0u64, |sum, v| sum.wrapping_mul(1_000_003).wrapping_add(*v));
     let mut random = ChaCha8Rng::seed_from_u64(number);
-    let mut next = || random.random_range(-share..=share);
+    let mut next = || random.random_range(-fraction..=fraction);
     let (dx, dy, dw, dh) = (next(), next(), next(), next());
     let (width, height) = (region.width * (1.0 + dw), region.height * (1.0 + dh));
     Rect {

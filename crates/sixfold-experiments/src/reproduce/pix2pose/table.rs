@@ -19,13 +19,13 @@ fn against_detection(rows: &[Row]) -> String {
         "\nPoses against detections (as the dissertation's table 3.9)\n\n| what | boxes | right boxes | ADD(-S) 10 %, all targets | of right boxes alone |\n|---|---|---|---|---|\n"
             .to_owned();
     for row in rows {
-        let (share, of_right) = match row.detection {
-            Some(d) => (Some(d.share), d.add_s),
+        let (fraction, of_right) = match row.detection {
+            Some(d) => (Some(d.fraction), d.add_s),
             None if row.key == "default" || row.key == "no-refinement" => (Some(1.0), row.scores.add_s),
             None => continue,
         };
-        let (share, all, right) = (digits(share), digits(row.scores.add_s), digits(of_right));
-        let _ = writeln!(out, "| {} | {} | {share} | {all} | {right} |", row.title, row.boxes);
+        let (fraction, all, right) = (digits(fraction), digits(row.scores.add_s), digits(of_right));
+        let _ = writeln!(out, "| {} | {} | {fraction} | {all} | {right} |", row.title, row.boxes);
     }
     out
 }

@@ -45,12 +45,12 @@ const TRAININGS: [Training; 9] = [
     training("fourfold-transformer-loss", "transformer loss", Of::Fourfold, |_| ()),
     training("fourfold-view-limits", "L1 with view limits", Of::Fourfold, |r| r.view_limits = true),
     training("fourfold-plain-l1", "L1", Of::Fourfold, |r| r.transformer_loss = false),
-    training("trained-mesh", "meshes, photographs only", Of::Others, |r| r.render_share = 0.0),
+    training("trained-mesh", "meshes, photographs only", Of::Others, |r| r.render_fraction = 0.0),
     training("trained-discriminator", "meshes, photographs only, with discriminators", Of::Others, |r| {
-        (r.render_share, r.adversarial) = (0.0, Some(true))
+        (r.render_fraction, r.adversarial) = (0.0, Some(true))
     }),
     training("trained-convex-hull", "convex hulls, photographs only", Of::Others, |r| {
-        (r.render_share, r.convex_hull) = (0.0, true)
+        (r.render_fraction, r.convex_hull) = (0.0, true)
     }),
 ];
 
