@@ -88,6 +88,9 @@ impl AutoEstimator {
     /// The first method that can find an object without a mesh, with the object prepared for it.
     fn without_mesh(&self, object: &AutoObject) -> Result<Option<Knowing<'_>>, EstimatorError> {
         for (number, member) in self.members.iter().enumerate() {
+            if !member.knows(&object.object) {
+                continue;
+            }
             if let (Ok(prepared), _) = object.prepared(number, member.as_ref())? {
                 return Ok(Some((member.as_ref(), prepared)));
             }
@@ -169,7 +172,7 @@ impl AutoEstimator {
         };
         let mut possible = 0;
         for (number, member) in self.members.iter().enumerate() {
-            if !can_answer(member.as_ref(), &asked) {
+            if !can_answer(member.as_ref(), &asked) || !member.knows(&object.object) {
                 continue;
             }
             possible += 1;

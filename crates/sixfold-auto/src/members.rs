@@ -8,7 +8,8 @@ use sixfold_detect::detector::TrainedDetector;
 use sixfold_estimator::{EstimatorError, PoseEstimator};
 use sixfold_mttm::model::MttmModel;
 use sixfold_mttm::{MttmEstimator, MttmOptions};
-use sixfold_pix2pose::estimator::Pix2PoseEstimator;
+use sixfold_pix2pose::model::Pix2PoseModel;
+use sixfold_pix2pose::own_weights::OwnWeights;
 use sixfold_ppf::PpfEstimator;
 use sixfold_views::ViewsRefiner;
 use sixfold_views::estimator::ViewsEstimator;
@@ -18,7 +19,8 @@ use crate::estimator::AutoEstimator;
 /// Which methods are included.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct AutoMembers<'a> {
-    /// A trained model of Pix2Pose, and the number of its object, for objects that do not give one.
+    /// A trained model of Pix2Pose, and the number of its object, for objects that do not give one; `None`: the weights that an
+    /// object has of its own, if it has any.
     pub pix2pose: Option<(&'a Path, Option<u32>)>,
     /// Leave out the views in colour.
     pub without_views: bool,
@@ -29,7 +31,7 @@ pub struct AutoMembers<'a> {
 }
 
 impl AutoMembers<'_> {
-    /// The method `auto` over point pair features, templates, Pix2Pose if there is a model, and views.
+    /// The method `auto` over point pair features, templates, Pix2Pose for what it was trained on, and views.
     ///
     /// # Errors
     /// [`EstimatorError::Method`] if the file of Pix2Pose is not such a model, or a shipped network cannot be read (never if the
@@ -44,13 +46,15 @@ impl AutoMembers<'_> {
             ..MttmEstimator::default()
         };
         let mut members: Vec<Arc<dyn PoseEstimator>> = vec![Arc::new(ppf), Arc::new(mttm)];
-        if let Some((weights, object_id)) = self.pix2pose {
-            let mut trained = Pix2PoseEstimator::load(weights).map_err(EstimatorError::method)?;
-            trained.options.estimate.seed = self.seed;
-            trained.object_id = object_id;
-            let refiner = ViewsRefiner::shipped().map_err(EstimatorError::method)?;
-            members.push(Arc::new(trained.with_refiner(Arc::new(refiner))));
-        }
+        let mut own = OwnWeights::default();
+        own.options.estimate.seed = self.seed;
+        own.refiner = Some(Arc::new(ViewsRefiner::shipped().map_err(EstimatorError::method)?));
+        members.push(match self.pix2pose {
+            Some((weights, object_id)) => {
+                Arc::new(own.with(Pix2PoseModel::load(weights).map_err(EstimatorError::method)?, object_id))
+            }
+            None => Arc::new(own),
+        });
         if !self.without_views {
             let mut views = ViewsEstimator::shipped().map_err(EstimatorError::method)?;
             views.options.seed = self.seed;

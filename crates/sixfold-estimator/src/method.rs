@@ -76,6 +76,12 @@ pub trait PoseEstimator: Send + Sync {
         MinConfidence { image: 0.0, dataset: 0.0 }
     }
 
+    /// Whether the object has what the method needs of it, as far as this can be said without reading a file. A caller that asks
+    /// several methods leaves this one out where it has not; [`PoseEstimator::prepare`] states what is missing.
+    fn knows(&self, _object: &Object) -> bool {
+        true
+    }
+
     /// Computes once from an object the data that every query needs; slow results are stored in the object's
     /// folder ([`Object::file`]).
     ///

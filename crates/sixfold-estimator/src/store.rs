@@ -1,7 +1,7 @@
 //! Named objects: a folder with one folder per object.
 //!
 //! An object's folder holds `object.json` (format version, unit, symmetries, source file), `mesh.ply` (metres), and data that
-//! methods derive from it (`ppf.bin`, `templates.bin`). An object added from depth images has templates and no mesh. A folder is
+//! methods derive from it (`ppf.bin`, `templates.bin`) or learn for it (`pix2pose.safetensors`). An object added from depth images has templates and no mesh. A folder is
 //! written under another name first and moved into place as a whole; one that is replaced or removed is moved away first. One
 //! process at a time changes an object; after a killed process, the next one cleans up.
 
@@ -127,7 +127,7 @@ pub enum StoreError {
         /// The system's error.
         source: io::Error,
     },
-    /// Derived data of the new object could not be computed or stored; nothing was stored.
+    /// Derived data of an object could not be computed or stored; a new object was not stored either.
     #[error("cannot store {}", path.display())]
     Derive {
         /// The object's folder.
@@ -530,6 +530,23 @@ impl ObjectStore {
         result.map_err(|source| StoreError::Derive { path: place, source })
     }
 
+    /// Calls `add` with a stored object, to add data to its folder while no other process replaces or removes it.
+    ///
+    /// # Errors
+    /// [`StoreError`] where there is none or another process changes it, and [`StoreError::Derive`] if `add` fails.
+    pub fn extend(
+        &self,
+        name: &str,
+        add: impl FnOnce(&Object) -> Result<(), Source>,
+    ) -> Result<(), StoreError> {
+        let place = self.writable_place(name)?;
+        // The error lists the existing objects.
+        self.record(name)?;
+        let _lock = WriteLock::take(&place)?;
+        let object = self.load(name)?;
+        add(&object).map_err(|source| StoreError::Derive { path: place, source })
+    }
+
     /// Removes an object.
     ///
     /// # Errors
@@ -694,6 +711,25 @@ mod tests {
         assert!(store.load("part").unwrap().file("kept.bin").unwrap().is_file());
         // Nothing else is left in the store.
         assert_eq!(std::fs::read_dir(root.path().join("store")).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn data_are_added_to_an_object_that_is_there() {
+        let root = tempfile::tempdir().unwrap();
+        let store = ObjectStore::new(root.path());
+        let write = |object: &Object| Ok(std::fs::write(object.file("weights.bin").unwrap(), b"weights")?);
+        assert!(matches!(store.extend("part", write), Err(StoreError::Unknown { .. })));
+        add(&store, 1.0, false, Ok(())).unwrap();
+        store.extend("part", write).unwrap();
+        for kept in ["weights.bin", "kept.bin"] {
+            assert!(store.load("part").unwrap().file(kept).unwrap().is_file(), "{kept}");
+        }
+        let failed = store.extend("part", |_| Err("the disk is full".into())).unwrap_err();
+        assert!(std::error::Error::source(&failed).unwrap().to_string().contains("the disk is full"));
+        // Nobody else changes it meanwhile.
+        let meanwhile = store.extend("part", |_| Ok(store.remove("part")?)).unwrap_err();
+        assert!(std::error::Error::source(&meanwhile).unwrap().to_string().contains("another process"));
+        assert_eq!(store.names().unwrap(), ["part"]);
     }
 
     /// Both kinds of failure between the two renames: the second one fails, or the process dies.

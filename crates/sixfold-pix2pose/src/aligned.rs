@@ -47,6 +47,16 @@ impl Default for AlignOptions {
 }
 
 impl AlignOptions {
+    /// The dissertation's form: its two stages with its parameters, one pass, no correction.
+    pub fn published() -> AlignOptions {
+        AlignOptions {
+            estimate: Pix2PoseOptions::published(),
+            looks: 1,
+            correct: false,
+            ..AlignOptions::default()
+        }
+    }
+
     /// Checks every field, including those of both passes and of the alignment.
     ///
     /// # Errors

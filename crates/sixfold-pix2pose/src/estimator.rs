@@ -15,11 +15,11 @@ use sixfold_mesh::Mesh;
 
 use crate::aligned::{AlignOptions, AlignedObject, estimate_aligned};
 use crate::depth::align;
-use crate::estimate::{EstimateError, Found, Pix2PoseOptions, View, estimate};
+use crate::estimate::{EstimateError, Found, View, estimate};
 use crate::model::Pix2PoseModel;
 use crate::object::ObjectEntry;
 
-const METHOD: &str = "pix2pose";
+pub(crate) const METHOD: &str = "pix2pose";
 
 /// Poses from colour in given regions by a trained network (dissertation, chapter 3).
 #[derive(Clone)]
@@ -63,17 +63,6 @@ impl Pix2PoseEstimator {
     #[must_use]
     pub fn with_refiner(self, refiner: Arc<dyn PoseRefiner>) -> Pix2PoseEstimator {
         Pix2PoseEstimator { refiner: Some(refiner), ..self }
-    }
-
-    /// The same in the dissertation's form: its two stages with its parameters, one pass, no alignment of the outline.
-    pub fn published(self) -> Pix2PoseEstimator {
-        let options = AlignOptions {
-            estimate: Pix2PoseOptions::published(),
-            looks: 1,
-            correct: false,
-            ..AlignOptions::default()
-        };
-        Pix2PoseEstimator { options, refine: false, ..self }
     }
 
     /// The model's entry of an object; without an id, of its only one.
@@ -211,7 +200,7 @@ impl PoseEstimator for Pix2PoseEstimator {
     }
 
     fn depth_options(&self) -> DepthOptions {
-        DepthOptions { normals: NormalOptions::default(), remove_plane: false, ..DepthOptions::default() }
+        depth_for_icp()
     }
 
     fn prepare(&self, object: &Object) -> Result<Box<dyn PreparedObject>, EstimatorError> {
@@ -272,6 +261,11 @@ impl PoseEstimator for Pix2PoseEstimator {
         }
         Ok(vec![estimate])
     }
+}
+
+/// How depth images are prepared for ICP.
+pub(crate) fn depth_for_icp() -> DepthOptions {
+    DepthOptions { normals: NormalOptions::default(), remove_plane: false, ..DepthOptions::default() }
 }
 
 /// Details of an estimate: whether the outline was aligned, ICP, the square of the image in the last pass (x, y, side), and all

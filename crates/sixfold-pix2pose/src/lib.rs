@@ -14,6 +14,7 @@ pub mod model;
 pub mod networks;
 pub mod object;
 mod outlier_threshold;
+pub mod own_weights;
 pub mod preset;
 pub mod recipe;
 pub mod refine;

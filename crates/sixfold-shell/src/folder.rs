@@ -55,6 +55,13 @@ impl Contents {
         hash.write(&info.contents_hash().to_le_bytes());
     }
 
+    /// One hash of all of them.
+    pub fn value(&self) -> u64 {
+        let mut all = Fnv1a::default();
+        all.write(self.to_json().to_string().as_bytes());
+        all.value()
+    }
+
     fn to_json(&self) -> Value {
         self.0.iter().map(|(name, hash)| (name.clone(), json!(format!("{:016x}", hash.value())))).collect()
     }
@@ -83,6 +90,11 @@ impl DatasetFolder {
             None => refuse_contents(path)?,
         }
         Ok(folder)
+    }
+
+    /// The folder.
+    pub fn path(&self) -> &Path {
+        &self.path
     }
 
     /// Stores the hashes of the inputs, or compares them with those stored when the folder was started. Nothing is written

@@ -18,6 +18,10 @@ pub mod grasp;
 pub mod idle;
 mod labels;
 pub mod meshes;
+#[cfg(feature = "networks")]
+pub mod new_views;
+#[cfg(feature = "networks")]
+pub mod object_training;
 pub mod objects;
 pub mod output;
 pub mod overlay;

@@ -84,6 +84,15 @@ pub fn surface_noise(text: &str) -> Result<f64, String> {
     noise.ok_or_else(|| format!("found {text}, expected millimetres, 0 to 100"))
 }
 
+/// Parses the step between views in degrees.
+///
+/// # Errors
+/// What is wrong with it.
+pub fn view_step(text: &str) -> Result<f64, String> {
+    let step = text.parse().ok().filter(|step: &f64| (1.0..=90.0).contains(step));
+    step.ok_or_else(|| format!("found {text}, expected degrees from 1 to 90"))
+}
+
 /// Parses the name of a folder within another, such as a split of a dataset.
 ///
 /// # Errors

@@ -14,6 +14,7 @@ use sixfold_nn::train_error::TrainError;
 use sixfold_nn::training::Outcome;
 use sixfold_nn::training_log::TrainingRecord;
 use sixfold_nn::weights::ModelCard;
+use sixfold_pix2pose::recipe::Pix2PoseRecipe;
 
 use crate::datasets;
 use crate::objects;
@@ -186,6 +187,27 @@ pub fn train_in<R: Recipe>(
         Err(TrainError::Option(error)) => Err(by_flag(&error)),
         Err(error) => Err(error.into()),
     }
+}
+
+/// Trains Pix2Pose in `out`, or resumes the training there, or only writes the model of its last checkpoint; as [`train_in`].
+///
+/// # Errors
+/// As [`train_in`].
+pub fn train_pix2pose(
+    recipe: &Pix2PoseRecipe,
+    material: TrainingSet,
+    out: &Path,
+    export_only: bool,
+    by_flag: impl Fn(&OptionError) -> anyhow::Error,
+) -> Result<Trained<()>> {
+    let shown = Shown {
+        preparing: "samples",
+        measuring: "alignment measured on the photographs",
+        message: |record| {
+            format!("L1 {:.4}, {:.0} images/s", loss(record, "coordinates"), record.samples_per_second)
+        },
+    };
+    train_in(recipe, material, out, export_only, shown, by_flag)
 }
 
 /// A progress bar of the current activity, and notes.

@@ -21,6 +21,8 @@ use crate::snapshot::Snapshot;
 
 /// Folder of the photographs in an object's folder.
 const PHOTOGRAPHS: &str = "photographs";
+/// The mesh in the folder of a teaching.
+const MESH: &str = "mesh.ply";
 /// Noise of a surface made from photographs, standard deviation as a fraction of the diameter.
 const NOISE: f64 = 0.004;
 
@@ -47,6 +49,19 @@ impl Snapshot {
         Ok(symmetries_of(&mesh, ModelInfo::of_mesh(&mesh).diameter))
     }
 
+    /// The object of this name, if it was stored from this folder as it is now, by [`Snapshot::store`].
+    ///
+    /// # Errors
+    /// [`TeachError::Order`] before the mesh is made, [`TeachError::Store`].
+    pub fn stored(&self, store: &ObjectStore, name: &str) -> Result<Option<Stored>, TeachError> {
+        let (record, object, mesh) = (store.record(name)?, store.load(name)?, self.mesh()?);
+        let same = object.mesh.is_some_and(|there| there.contents_hash() == mesh.contents_hash());
+        if !same || record.source != self.folder().join(MESH).display().to_string() {
+            return Ok(None);
+        }
+        Ok(Some(Stored { record, symmetries: self.symmetries()?, photographs: self.posed()?.len() }))
+    }
+
     /// Stores the object under a name. `derive` computes the data that methods derive from it, as in [`ObjectStore::add`].
     ///
     /// # Errors
@@ -62,7 +77,7 @@ impl Snapshot {
         let mut info = ModelInfo::of_mesh(&mesh);
         let symmetries = symmetries_of(&mesh, info.diameter);
         (info.symmetries_discrete, info.symmetries_continuous) = sure_symmetries(&symmetries, true);
-        let source = self.folder().join("mesh.ply");
+        let source = self.folder().join(MESH);
         let record = ObjectRecord::of_mesh(&source, Unit::Metre, &mesh, &info);
         let posed = self.posed()?;
         let new = NewObject { mesh: Some(&mesh), record: &record, replace };

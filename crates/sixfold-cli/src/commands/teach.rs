@@ -1,8 +1,9 @@
-//! `sixfold teach`: a new object from photographs of it, on the printed board or without one.
+//! `sixfold teach`: a new object from photographs of it, on the printed board or without one, and a network trained for it.
 
+use std::num::NonZeroUsize;
 use std::path::{Path, PathBuf};
 
-use anyhow::{Result, anyhow, bail};
+use anyhow::{Result, anyhow};
 use clap::Args;
 use serde::Serialize;
 use sixfold_auto::prepare_all;
@@ -11,9 +12,10 @@ use sixfold_io::write_rgb;
 use sixfold_mesh::{Unit, Verdict};
 use sixfold_shell::Outcome;
 use sixfold_shell::board::Ends;
+use sixfold_shell::object_training::{ObjectTraining, STEPS, TrainedObject, VIEW_STEP};
 use sixfold_shell::output::{JsonArguments, report};
 use sixfold_shell::progress::Bar;
-use sixfold_shell::ranges;
+use sixfold_shell::ranges::{self, count};
 use sixfold_shell::symmetries::described;
 use sixfold_shell::teachings::{LeftOut, TeachingFiles};
 use sixfold_teach::{SalientSegmenter, ShapeOptions};
@@ -24,7 +26,9 @@ pub(crate) const AFTER_HELP: &str = "Examples:\n  \
     sixfold teach mug --photographs colour --depth depth --depth-scale 1 --camera camera.json\n  \
     sixfold teach mug --photographs photographs --no-board --length 0.12 --ends a.jpg:812,640:1010,655 b.jpg:700,655:934,628\n  \
     sixfold teach mug --photographs photographs.json      # with poses, masks and depth from elsewhere\n  \
-    sixfold estimate --rgb image.png --camera camera.json --object mug --method views --out out";
+    sixfold teach mug --train                             # a network for the object taught before\n  \
+    sixfold estimate --rgb image.png --camera camera.json --object mug --method views --out out\n\n\
+    After a stop, the same command resumes.";
 
 #[derive(Debug, Args)]
 pub(crate) struct TeachArguments {
@@ -32,7 +36,7 @@ pub(crate) struct TeachArguments {
     pub name: String,
     /// Photographs of the object, on the board unless --no-board (PNG, JPEG), or folders of them: 8 to 40, from all sides; or one
     /// JSON file that lists photographs with the object's pose in each, masks and depth (docs/teach.md), without a board
-    #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
+    #[arg(long, required_unless_present = "train", num_args = 1.., value_name = "DIR")]
     pub photographs: Vec<PathBuf>,
     /// Depth images from the same viewpoints (PNG, 16 bit), or folders of them, in the order of the photographs' names
     #[arg(long, num_args = 1.., value_name = "DIR", requires = "depth_scale")]
@@ -66,24 +70,51 @@ pub(crate) struct TeachArguments {
     /// Do not search for hollows by comparing photographs
     #[arg(long)]
     pub hull_only: bool,
+    /// Then train Pix2Pose for the object on views synthesized from its photographs, and store the weights with it; without
+    /// --photographs on those of the object taught before
+    #[arg(long)]
+    pub train: bool,
+    #[arg(long, value_name = "N", requires = "train", value_parser = count::<1_000_000>, help = steps_help())]
+    pub train_steps: Option<NonZeroUsize>,
+    #[arg(long, value_name = "DEGREES", requires = "train", value_parser = ranges::view_step, help = view_step_help())]
+    pub view_step: Option<f64>,
     /// Folder of stored objects
     #[arg(long, value_name = "DIR", env = "SIXFOLD_STORE", default_value = "sixfold-objects")]
     pub store: PathBuf,
-    /// Replace an object of the same name
+    /// Replace an object of the same name; without --photographs its weights
     #[arg(long)]
     pub replace: bool,
-    /// Folder for masks, mesh and images; a stopped run resumes there (default: out/teach/NAME)
+    /// Folder for masks, mesh, images and the training; a stopped run resumes there (default: out/teach/NAME)
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
     #[command(flatten)]
     pub json: JsonArguments,
 }
 
+fn steps_help() -> String {
+    format!(
+        "Training steps (default: {STEPS}, about 12 minutes of processor time with the views); more steps give better poses"
+    )
+}
+
+fn view_step_help() -> String {
+    format!("Degrees between synthesized views, in azimuth and elevation (default: {VIEW_STEP})")
+}
+
 #[derive(Serialize)]
-struct Taught<'a> {
+struct Answer<'a> {
     name: &'a str,
     #[serde(flatten)]
-    record: &'a ObjectRecord,
+    record: ObjectRecord,
+    #[serde(flatten)]
+    taught: Option<Taught>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    trained: Option<TrainedObject>,
+}
+
+/// Facts about an object that was taught now.
+#[derive(Serialize)]
+struct Taught {
     /// Number of used photographs.
     photographs: usize,
     left_out: Vec<LeftOut>,
@@ -92,7 +123,7 @@ struct Taught<'a> {
     /// Fraction of the object's pixels whose depth was measured, or found by comparing photographs.
     with_depth: f64,
     symmetries_proposed: Vec<String>,
-    folder: &'a Path,
+    folder: PathBuf,
 }
 
 pub(crate) fn run(a: &TeachArguments) -> Result<Outcome> {
@@ -100,15 +131,42 @@ pub(crate) fn run(a: &TeachArguments) -> Result<Outcome> {
     if let Err(error @ StoreError::Name(_)) = store.record(&a.name) {
         return Err(error.into());
     }
-    if store.contains(&a.name) && !a.replace {
-        bail!(
-            "there is an object named {:?} in {} already: give --replace or another name",
+    let out = a.out.clone().unwrap_or_else(|| Path::new("out/teach").join(&a.name));
+    let (record, taught) = match a.photographs.is_empty() {
+        true => (None, None),
+        false => teach(a, &store, &out).map(|(record, taught)| (Some(record), Some(taught)))?,
+    };
+    let training = ObjectTraining {
+        store: &store,
+        name: &a.name,
+        steps: a.train_steps.map_or(STEPS, NonZeroUsize::get),
+        view_step: a.view_step.unwrap_or(VIEW_STEP),
+        replace: a.replace,
+        out: &out,
+    };
+    let trained = a.train.then(|| training.run()).transpose()?;
+    let record = record.map_or_else(|| store.record(&a.name), Ok)?;
+    let answer = Answer { name: &a.name, record, taught, trained };
+    report(&a.json, &answer, || print(&answer))?;
+    Ok(Outcome::Found)
+}
+
+/// Makes the object's record and stores it, unless an earlier run of the same command did.
+fn teach(a: &TeachArguments, store: &ObjectStore, out: &Path) -> Result<(ObjectRecord, Taught)> {
+    let there = store.contains(&a.name) && !a.replace;
+    let refused = || {
+        let only = if a.train { ", or leave out --photographs to train on its own" } else { "" };
+        anyhow!(
+            "there is an object named {:?} in {} already: give --replace or another name{only}",
             a.name,
             a.store.display()
-        );
+        )
+    };
+    // Only a training may have been stopped after the object was stored.
+    if there && !(a.train && out.join("teaching.json").exists()) {
+        return Err(refused());
     }
-    let out = a.out.clone().unwrap_or_else(|| Path::new("out/teach").join(&a.name));
-    let mut teaching = files(a).open(&out)?;
+    let mut teaching = files(a).open(out)?;
     let options = ShapeOptions { stereo: !a.hull_only, ..ShapeOptions::default() };
     let bar = Bar::stopped_by_interrupts("finding poses");
     teaching.locate(&bar)?;
@@ -120,21 +178,21 @@ pub(crate) fn run(a: &TeachArguments) -> Result<Outcome> {
     teaching.reconstruct(&options, &bar)?;
     bar.finish();
     write_rgb(&out.join("photographs.png"), &teaching.picture()?)?;
-    let stored = teaching.store(&store, &a.name, a.replace, prepare_all)?;
+    let stored = match there {
+        true => teaching.stored(store, &a.name)?.ok_or_else(refused)?,
+        false => teaching.store(store, &a.name, a.replace, prepare_all)?,
+    };
     let facts = teaching.shape().ok_or_else(|| anyhow!("{}: no mesh was made", out.display()))?;
     let proposed = stored.symmetries.iter().filter(|s| s.verdict(true) != Verdict::Sure);
     let taught = Taught {
-        name: &a.name,
-        record: &stored.record,
         photographs: stored.photographs,
         left_out: LeftOut::all(&teaching),
         unseen: facts.unseen,
         with_depth: facts.with_depth,
         symmetries_proposed: proposed.map(described).collect(),
-        folder: &out,
+        folder: out.to_path_buf(),
     };
-    report(&a.json, &taught, || print(&taught))?;
-    Ok(Outcome::Found)
+    Ok((stored.record, taught))
 }
 
 /// The files that the arguments name.
@@ -152,22 +210,27 @@ fn files(a: &TeachArguments) -> TeachingFiles<'_> {
     }
 }
 
-fn print(t: &Taught<'_>) {
-    for left in &t.left_out {
-        println!("left out {}: {}", left.photograph, left.reason);
+fn print(answer: &Answer<'_>) {
+    let Answer { name, record, .. } = answer;
+    if let Some(t) = &answer.taught {
+        for left in &t.left_out {
+            println!("left out {}: {}", left.photograph, left.reason);
+        }
+        println!(
+            "taught {name} from {} photographs: diameter {:.1} mm, {} faces, {:.0} % of the surface in no photograph",
+            t.photographs,
+            1000.0 * record.diameter,
+            record.faces,
+            100.0 * t.unseen
+        );
+        let (discrete, axes) = (record.symmetries_discrete.len(), record.symmetries_continuous.len());
+        println!("symmetries: {discrete} rotations and {axes} axes stored");
+        for proposed in &t.symmetries_proposed {
+            println!("  perhaps {proposed}: `sixfold object symmetries {name} --noise 1`");
+        }
+        println!("inspect {}", t.folder.join("photographs.png").display());
     }
-    println!(
-        "taught {} from {} photographs: diameter {:.1} mm, {} faces, {:.0} % of the surface in no photograph",
-        t.name,
-        t.photographs,
-        1000.0 * t.record.diameter,
-        t.record.faces,
-        100.0 * t.unseen
-    );
-    let (discrete, axes) = (t.record.symmetries_discrete.len(), t.record.symmetries_continuous.len());
-    println!("symmetries: {discrete} rotations and {axes} axes stored");
-    for proposed in &t.symmetries_proposed {
-        println!("  perhaps {proposed}: `sixfold object symmetries {} --noise 1`", t.name);
+    if let Some(trained) = &answer.trained {
+        trained.print();
     }
-    println!("inspect {}", t.folder.join("photographs.png").display());
 }

@@ -36,6 +36,8 @@ mod support;
 mod synthesize;
 #[cfg(feature = "networks")]
 mod teach;
+#[cfg(feature = "networks")]
+mod teach_and_train;
 mod teach_without_board;
 #[cfg(feature = "networks")]
 mod trainings;

@@ -323,3 +323,28 @@ pub fn truncate(file: &Path, fraction: f64) {
     let bytes = std::fs::read(file).unwrap();
     std::fs::write(file, &bytes[..(fraction * bytes.len() as f64) as usize]).unwrap();
 }
+
+/// Lists the images of a dataset as photographs of object 1 with poses, depth and masks: `photographs.json` beside it, for `sixfold
+/// teach`.
+#[allow(dead_code)]
+pub fn write_posed_photographs(tiny: &Tiny) {
+    let entries: Vec<Value> = tiny
+        .truth
+        .iter()
+        .map(|(im_id, _)| {
+            let pose = tiny.truth_of(*im_id, 1);
+            let (r, t) = (pose.rotation_matrix(), pose.translation() * 1000.0);
+            let rows: Vec<f64> = (0..9).map(|i| r[(i / 3, i % 3)]).collect();
+            let alone = sixfold_render::render_depth(&part(), &pose, &camera());
+            let mask = format!("{im_id}-mask.png");
+            sixfold_io::write_mask(&tiny.path().join(&mask), &alone.map(|&z| z > 0.0)).unwrap();
+            serde_json::json!({
+                "image": format!("tiny/test/000007/rgb/{im_id:06}.png"), "camera": "tiny/camera.json", "mask": mask,
+                "depth": format!("tiny/test/000007/depth/{im_id:06}.png"), "depth_scale": 1000.0 * DEPTH_SCALE,
+                "cam_R_m2c": rows, "cam_t_m2c": [t.x, t.y, t.z],
+            })
+        })
+        .collect();
+    let file = serde_json::json!({ "photographs": entries });
+    std::fs::write(tiny.path().join("photographs.json"), file.to_string()).unwrap();
+}

@@ -8,7 +8,7 @@ use sixfold_io::write_mask;
 use sixfold_render::render_depth;
 
 use crate::driver::{Row, copy, kept, reference, run};
-use crate::support::{OneImage, Tiny, camera, part, sixfold};
+use crate::support::{OneImage, Tiny, camera, part, sixfold, write_posed_photographs};
 
 /// One image with depth, the object's mask and mesh.
 fn image(folder: &Path) {
@@ -83,6 +83,19 @@ fn stores(folder: &Path) {
     copy(&CASE, folder);
 }
 
+/// An object that was taught from the images of the dataset.
+fn taught(folder: &Path) {
+    static CASE: LazyLock<PathBuf> = LazyLock::new(|| {
+        let tiny = Tiny::coloured();
+        write_posed_photographs(&tiny);
+        sixfold(tiny.path(), "teach part --photographs photographs.json --hull-only").expect(0);
+        let folder = kept("taught");
+        copy(&tiny.path().join("sixfold-objects"), &folder.join("sixfold-objects"));
+        folder
+    });
+    copy(&CASE, folder);
+}
+
 /// The image, and an object that is stored already.
 fn object(folder: &Path) {
     image(folder);
@@ -128,6 +141,7 @@ rows! {
          --camera camera.json --out out";
     synthesize: dataset, ["out"], None,
         "synthesize --dataset tiny --ids 1 --step 90 --elevation 30,30 --size 48 --weighting average --with-photographs --out out";
+    teach_train: taught, ["out", "sixfold-objects"], None, "teach part --train --train-steps 2 --view-step 90 --out out";
     object_add: image, ["sixfold-objects"], Some((2, "--replace")),
         "object add part part.ply --unit mm --templates";
     object_add_views: image, ["sixfold-objects"], Some((2, "--replace")),

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
-use anyhow::{Context, Result, anyhow};
+use anyhow::{Context, Result, bail};
 use clap::Args;
 use sixfold_auto::AutoMembers;
 use sixfold_detect::detector::TrainedDetector;
@@ -15,7 +15,8 @@ use sixfold_estimator::{ObjectDetector, PoseEstimator, Region};
 use sixfold_geometry::RgbImage;
 use sixfold_mttm::model::MttmModel;
 use sixfold_mttm::{MatchedBy, MttmEstimator};
-use sixfold_pix2pose::estimator::Pix2PoseEstimator;
+use sixfold_pix2pose::model::Pix2PoseModel;
+use sixfold_pix2pose::own_weights::OwnWeights;
 use sixfold_runner::RegionSource;
 use sixfold_shell::ranges::{self, count};
 use sixfold_views::ViewsRefiner;
@@ -48,7 +49,8 @@ pub(super) const AUTO: Method = Method::of::<AutoArguments>(
 
 #[derive(Debug, Args)]
 struct AutoArguments {
-    /// Weights that `sixfold train pix2pose` wrote; for mttm and views a network to use instead of the built-in one
+    /// Weights that `sixfold train pix2pose` wrote (default: the object's own, from `sixfold teach --train`); for mttm and views a
+    /// network to use instead of the built-in one
     #[arg(long, value_name = "FILE.safetensors")]
     weights: Option<PathBuf>,
     /// Start no further method for an object after this time, such as 1s or 500ms; the result then depends on the machine
@@ -104,7 +106,8 @@ impl MethodArguments for ViewsArguments {
 
 #[derive(Debug, Args)]
 struct Pix2PoseArguments {
-    /// Weights that `sixfold train pix2pose` wrote; for mttm and views a network to use instead of the built-in one
+    /// Weights that `sixfold train pix2pose` wrote (default: the object's own, from `sixfold teach --train`); for mttm and views a
+    /// network to use instead of the built-in one
     #[arg(long, value_name = "FILE.safetensors")]
     weights: Option<PathBuf>,
     #[command(flatten)]
@@ -123,27 +126,25 @@ struct Pix2PoseArguments {
 
 impl MethodArguments for Pix2PoseArguments {
     fn build(self, common: &CommonArguments) -> Result<Box<dyn PoseEstimator>> {
-        let weights = self.weights.as_deref().ok_or_else(|| {
-            anyhow!(
-                "--method pix2pose needs --weights FILE.safetensors, which `sixfold train pix2pose` writes"
-            )
-        })?;
-        let mut estimator = Pix2PoseEstimator::load(weights)?;
-        if self.preset.published() {
-            estimator = estimator.published();
-        }
-        estimator.options.estimate.seed = common.seed;
+        let mut own = if self.preset.published() { OwnWeights::published() } else { OwnWeights::default() };
+        own.options.estimate.seed = common.seed;
         if let Some(passes) = self.passes {
-            estimator.options.looks = passes.get();
+            own.options.looks = passes.get();
         }
-        estimator.refine &= !self.no_refine;
-        estimator.icp = self.icp;
-        estimator.object_id = common.object_id;
-        if estimator.refine {
+        own.refine &= !self.no_refine;
+        own.icp = self.icp;
+        if own.refine {
             let refiner = ViewsRefiner::shipped().context("the refiner within the program")?;
-            estimator = estimator.with_refiner(Arc::new(refiner));
+            own.refiner = Some(Arc::new(refiner));
         }
-        Ok(Box::new(estimator))
+        match self.weights {
+            Some(file) => Ok(Box::new(own.with(Pix2PoseModel::load(&file)?, common.object_id))),
+            None if common.dataset.is_none() && !common.objects.is_empty() => Ok(Box::new(own)),
+            None => bail!(
+                "--method pix2pose needs --weights FILE.safetensors, which `sixfold train pix2pose` writes, or --object NAME of an \
+                 object with weights of its own (`sixfold teach NAME --train`)"
+            ),
+        }
     }
 }
 

@@ -7,6 +7,7 @@ use clap::{Args, ValueEnum};
 use serde_json::{Value, json};
 use sixfold_nol::refine::{PoseRefinementOptions, SceneKind};
 use sixfold_nol::view_grid::ViewGrid;
+use sixfold_shell::new_views::{ChosenBy, Refinement};
 use sixfold_shell::output::JsonArguments;
 use sixfold_shell::ranges::{self, in_range, without_duplicates};
 
@@ -222,12 +223,20 @@ impl SynthesizeArguments {
     }
 
     /// The criterion by which photographs are chosen.
-    pub fn select(&self) -> SelectKind {
+    fn select(&self) -> SelectKind {
         self.select.unwrap_or(if self.preset.is_some() { SelectKind::Pose } else { SelectKind::Surface })
     }
 
+    /// The same for the library.
+    pub fn chosen_by(&self) -> ChosenBy {
+        match self.select() {
+            SelectKind::Surface => ChosenBy::Surface,
+            SelectKind::Pose => ChosenBy::Pose(self.seed),
+        }
+    }
+
     /// The kind of pose refinement.
-    pub fn refinement_kind(&self) -> RefinementKind {
+    fn refinement_kind(&self) -> RefinementKind {
         let default = if self.preset.is_some() { RefinementKind::Published } else { RefinementKind::Ours };
         self.refinement.unwrap_or(default)
     }
@@ -238,16 +247,22 @@ impl SynthesizeArguments {
         ViewGrid { step, elevation, turns: self.turns(), size: self.size, seed: self.seed }
     }
 
-    /// The options of pose refinement; `None` if poses are not refined.
-    pub fn refinement(&self) -> Option<PoseRefinementOptions> {
+    /// How poses are refined.
+    pub fn refinement(&self) -> Refinement {
         let scene = match self.scene {
             SceneArgument::Judge => SceneKind::Judge,
             SceneArgument::Still => SceneKind::Still,
             SceneArgument::Moving => SceneKind::Moving,
         };
         let rough = [self.rough[0] * 1e-3, self.rough[1].to_radians()];
-        let options = PoseRefinementOptions { scene, rough, seed: self.seed, ..Default::default() };
-        (!self.no_refine).then_some(options)
+        match self.refinement_kind() {
+            _ if self.no_refine => Refinement::Given,
+            RefinementKind::Published => Refinement::Published,
+            RefinementKind::Ours => {
+                let seed = self.seed;
+                Refinement::Ours(PoseRefinementOptions { scene, rough, seed, ..Default::default() })
+            }
+        }
     }
 
     /// The options on which the result depends; a folder made with others is not resumed.

@@ -1,7 +1,5 @@
 //! Photographs with approximate poses: from a BOP dataset, or from a file that lists them.
 
-use std::collections::BTreeSet;
-
 use anyhow::{Context, Result, anyhow, bail};
 use sixfold_data::{RoughImageOptions, RoughImages, TrainingSetError};
 use sixfold_detect::detector::TrainedDetector;
@@ -10,6 +8,7 @@ use sixfold_geometry::RgbImage;
 use sixfold_runner::detections;
 use sixfold_shell::datasets;
 use sixfold_shell::folder::Contents;
+use sixfold_shell::new_views::add_contents;
 
 use super::arguments::SynthesizeArguments;
 
@@ -73,19 +72,6 @@ pub(super) fn contents(a: &SynthesizeArguments, images: &RoughImages) -> Result<
             contents.add_path(name, file)?;
         }
     }
-    let mut known = BTreeSet::new();
-    for object in &images.objects {
-        contents.add_object(&format!("object {}", object.id), &object.mesh, &object.info);
-        for image in &object.images {
-            let posed = &image.posed;
-            let hash = contents.of("photographs");
-            if known.insert(image.number) {
-                hash.write(posed.image().as_slice().as_flattened());
-            }
-            let pose = posed.camera_from_object().to_matrix();
-            pose.iter().for_each(|x| hash.write(&x.to_le_bytes()));
-            hash.write(format!("{} {:?} {:?}", posed.name(), posed.camera(), posed.mask()).as_bytes());
-        }
-    }
+    add_contents(&mut contents, images);
     Ok(contents)
 }

@@ -12,8 +12,7 @@ use sixfold_pix2pose::training::Pix2PoseTrainingOptions;
 
 use super::options::{self, Degrees, choices, presets};
 use super::{
-    LearntFrom, MaterialArguments, Shown, Summary, checked, command_line, loss, summary, train_in,
-    training_set,
+    LearntFrom, MaterialArguments, Summary, by_flag, checked, command_line, summary, training, training_set,
 };
 
 fn default() -> Pix2PoseRecipe {
@@ -194,13 +193,6 @@ pub(crate) fn train_pix2pose(a: &TrainPix2PoseArguments) -> Result<Summary<Learn
     let material = training_set(&a.material, MIN_VISIBILITY)?;
     let objects = material.objects.iter().map(|o| o.id).collect();
     let learnt_from = LearntFrom { objects, photographs: material.images.len() };
-    let shown = Shown {
-        preparing: "samples",
-        measuring: "alignment measured on the photographs",
-        message: |record| {
-            format!("L1 {:.4}, {:.0} images/s", loss(record, "coordinates"), record.samples_per_second)
-        },
-    };
-    let trained = train_in(&recipe, material, &a.out, a.export, shown)?;
+    let trained = training::train_pix2pose(&recipe, material, &a.out, a.export, by_flag)?;
     Ok(summary(trained, |()| learnt_from))
 }
