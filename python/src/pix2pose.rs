@@ -47,6 +47,9 @@ pub(crate) struct Pix2PosePose {
     /// Whether enough of the mesh's outline was found in the image to align it.
     #[pyo3(get)]
     refined: bool,
+    /// Agreement of the image with the refined pose, 0 to 1; None without a mesh, or if the image does not show the object there.
+    #[pyo3(get)]
+    agreement: Option<f64>,
     /// Whether the pose was aligned with depth.
     #[pyo3(get)]
     aligned_to_depth: bool,
@@ -110,6 +113,7 @@ impl Posed {
             camera_from_object: arrays::from_pose(py, &self.pose.camera_from_object)?.unbind(),
             score: self.pose.score,
             refined: self.pose.refined,
+            agreement: self.pose.agreement,
             aligned_to_depth: self.aligned,
             hypotheses: list.unbind(),
             window: PyArray1::from_vec(py, vec![w.x, w.y, w.width, w.height]).unbind(),
@@ -153,7 +157,7 @@ impl Pix2Pose {
     /// Reads a weight file (.safetensors) that `train_pix2pose` or `sixfold train pix2pose` wrote.
     ///
     /// camera: the camera of the images, unless every call names its own; meshes {object id: Mesh}: with an object's mesh
-    /// its outline is aligned with the image as the last step.
+    /// its outline is aligned with the image, and its pose refined, as the last steps.
     ///
     /// Raises OSError when the file cannot be read, ValueError when it is no such model or a mesh is not that of its object.
     #[classmethod]

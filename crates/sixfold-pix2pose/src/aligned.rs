@@ -262,6 +262,8 @@ fn median(values: &mut [f64]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use sixfold_geometry::Vec3;
+    use sixfold_geometry::nalgebra::UnitQuaternion;
 
     #[test]
     fn distances_count_if_significant_against_their_scatter() {
@@ -302,6 +304,22 @@ mod tests {
         assert_eq!(named(AlignOptions { refine, ..options.clone() }), "refine.edges");
         let refine = OutlineRefinementOptions { first_pass: 1.5, ..options.refine.clone() };
         assert_eq!(named(AlignOptions { refine, ..options }), "refine.first_pass");
+    }
+
+    #[test]
+    fn a_pose_between_two_others() {
+        let from = Pose::new(UnitQuaternion::from_euler_angles(0.1, 0.2, 0.3), Vec3::new(0.02, -0.01, 0.6));
+        let to = Pose::new(UnitQuaternion::from_euler_angles(0.15, 0.1, 0.35), Vec3::new(0.03, -0.01, 0.63));
+        let near = |a: &Pose, b: &Pose| a.distance_to(b) < 1e-9 && a.rotation_angle_to(b) < 1e-7;
+        assert!(near(&between(&from, &to, 0.0), &from) && near(&between(&from, &to, 1.0), &to));
+        let third = between(&from, &to, 0.3);
+        let (whole, angle) = (from.distance_to(&to), from.rotation_angle_to(&to));
+        assert!(
+            (third.distance_to(&from) / whole - 0.3).abs() < 0.01,
+            "{}",
+            third.distance_to(&from) / whole
+        );
+        assert!((third.rotation_angle_to(&from) / angle - 0.3).abs() < 1e-6);
     }
 
     #[test]

@@ -75,3 +75,26 @@ impl RefinedObject for Refined {
         Ok((agreement > 0.0).then_some(RefinedPose { camera_from_object, agreement }))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::estimate::tests::{part, photographed};
+    use sixfold_geometry::Vec3;
+
+    #[test]
+    fn poses_of_another_method_move_to_the_image() {
+        let camera = Camera::new(570.0, 570.0, 320.0, 240.0, 640, 480).unwrap();
+        let (image, truth, _) = photographed(&camera);
+        let object = ViewsRefiner::shipped().unwrap().object(&part());
+        let error = |pose: &Pose| [pose.distance_to(&truth), pose.rotation_angle_to(&truth).to_degrees()];
+        let near = truth * Pose::exp(&[0.004, -0.003, 0.03, 0.08, -0.1, 0.06].into());
+        let refined = object.refine(&image, &camera, &near).unwrap().unwrap();
+        let (before, after) = (error(&near), error(&refined.camera_from_object));
+        assert!(after[0] < 0.5 * before[0] && after[1] < 0.5 * before[1], "{before:?} {after:?}");
+        let there = object.refine(&image, &camera, &truth).unwrap().unwrap();
+        assert!(there.agreement > 0.5, "{}", there.agreement);
+        let behind = truth.with_translation(Vec3::new(0.0, 0.0, -1.0));
+        assert_eq!(object.refine(&image, &camera, &behind).unwrap(), None);
+    }
+}

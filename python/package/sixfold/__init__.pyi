@@ -429,6 +429,8 @@ class Pix2PosePose:
     @property
     def refined(self) -> bool: ...
     @property
+    def agreement(self) -> float | None: ...
+    @property
     def aligned_to_depth(self) -> bool: ...
     @property
     def hypotheses(self) -> list[dict[str, Any]]: ...
@@ -965,6 +967,7 @@ def train_refiner(
     learning_rate: float = 0.001,
     batch: int = 4,
     backgrounds: Path | None = None,
+    init: Path | None = None,
     progress: Progress | None = None,
     seed: int = 0,
 ) -> dict[str, Any]: ...

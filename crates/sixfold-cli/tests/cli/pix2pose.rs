@@ -95,12 +95,15 @@ fn a_network_trained_on_three_images_finds_the_object_in_them() {
         aligned.distance_to(&truth)
     );
     assert!(json["poses"][0]["icp"]["inliers"].as_u64().unwrap() > 20);
+    let agreement = &json["poses"][0]["agreement"];
+    assert!(agreement.as_f64().is_some_and(|a| a > 0.0 && a <= 1.0), "the refiner saw it: {agreement}");
 
     // A pose is found without the mesh too.
     let bare = one_image(&tiny).replace("--object tiny/models/obj_000001.ply --unit mm", "");
     let run = sixfold(tiny.path(), &format!("{bare} --out bare --json")).expect(0);
     assert!(run.stderr.contains("without --object"), "{}", run.stderr);
     assert_eq!(run.json()["poses"][0]["refined"], false);
+    assert!(run.json()["poses"][0]["agreement"].is_null());
 
     // A score that no pose reaches: nothing found.
     let run = sixfold(tiny.path(), &format!("{} --min-score 1.01 --json", one_image(&tiny))).expect(1);

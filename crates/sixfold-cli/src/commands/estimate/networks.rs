@@ -112,7 +112,7 @@ struct Pix2PoseArguments {
     weights: Option<PathBuf>,
     #[command(flatten)]
     preset: PresetArguments,
-    /// Leave out the last step, which aligns the rendered mesh with the image
+    /// Leave out the last steps, which align the rendered mesh with the image and refine the pose
     #[arg(long)]
     no_refine: bool,
     /// Maximum number of passes over an object (default: 1). Each further pass crops the box of the previous pose, which helps with
