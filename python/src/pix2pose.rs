@@ -275,7 +275,9 @@ impl Pix2Pose {
             ..AlignOptions::default()
         };
         objects.extend(meshes.iter().map(|(id, (object, _))| (*id, object.clone())));
-        let estimator = Pix2PoseEstimator { options, refine, ..self.estimator.clone() };
+        // The depth image determines a pose better than the refiner does.
+        let refiner = self.estimator.refiner.clone().filter(|_| depth.is_none());
+        let estimator = Pix2PoseEstimator { options, refine, refiner, ..self.estimator.clone() };
         let prepared = match depth {
             None => None,
             Some(depth) => {

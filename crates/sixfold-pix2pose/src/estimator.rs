@@ -34,7 +34,7 @@ pub struct Pix2PoseEstimator {
     pub icp: bool,
     /// Id of the model's object, for objects that do not give one; `None`: its only object.
     pub object_id: Option<u32>,
-    /// Refines aligned poses.
+    /// Refines aligned poses, unless they are aligned with depth.
     pub refiner: Option<Arc<dyn PoseRefiner>>,
 }
 
@@ -126,7 +126,9 @@ impl Pix2PoseEstimator {
         let id = object.id;
         if let (true, Some(mesh)) = (self.refine, &object.mesh) {
             let outline = object.outline.get_or_init(|| outline_mesh(mesh));
-            let refined = self.refiner.as_ref().map(|by| object.refined.get_or_init(|| by.object(mesh)));
+            // The depth image determines a pose better than the refiner does.
+            let refiner = self.refiner.as_ref().filter(|_| !self.icp);
+            let refined = refiner.map(|by| object.refined.get_or_init(|| by.object(mesh)));
             let known = AlignedObject { id, outline, refiner: refined.map(AsRef::as_ref) };
             let aligned = estimate_aligned(&self.model, image, camera, known, bbox, &self.options)?;
             return Ok(aligned.map(|a| Pix2PosePose {

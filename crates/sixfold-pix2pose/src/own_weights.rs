@@ -25,7 +25,7 @@ pub struct OwnWeights {
     pub refine: bool,
     /// Align poses with the depth image.
     pub icp: bool,
-    /// Refines aligned poses.
+    /// Refines aligned poses, unless they are aligned with depth.
     pub refiner: Option<Arc<dyn PoseRefiner>>,
 }
 
