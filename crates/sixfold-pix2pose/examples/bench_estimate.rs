@@ -1,9 +1,11 @@
 //! Time per box of each part of an estimate: DATASET TARGETS.json WEIGHTS.
 use sixfold_align::outline::outline_mesh;
 use sixfold_bop::{BopDataset, Models, VISIBILITY_DELTA, ground_truth_visibility};
+use sixfold_estimator::PoseRefiner;
 use sixfold_pix2pose::estimate::{EstimateError, Pix2PoseOptions, estimate};
 use sixfold_pix2pose::model::Pix2PoseModel;
 use sixfold_pix2pose::refine::{OutlineRefinementOptions, refine};
+use sixfold_views::ViewsRefiner;
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::time::Instant;
@@ -13,11 +15,13 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let dataset = BopDataset::open(Path::new(&arguments[0]), "test")?;
     let targets = dataset.targets(Some(Path::new(&arguments[1])))?;
     let model = Pix2PoseModel::load(Path::new(&arguments[2]))?;
+    let refiner = ViewsRefiner::shipped()?;
     let mut meshes = BTreeMap::new();
     for object in model.objects() {
         let mesh = dataset.model(object.id, Models::Rendering)?;
         let small = outline_mesh(&mesh);
-        meshes.insert(object.id, (mesh, small));
+        let refined = refiner.object(&mesh);
+        meshes.insert(object.id, (mesh, small, refined));
     }
     let side = model.sizes().input;
     let crops: Vec<f32> = (0..4 * 3 * side * side).map(|i| (i % 251) as f32 / 251.0).collect();
@@ -32,14 +36,14 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         times.sort_by(f64::total_cmp);
         println!("network, {count} crops: {:.1} ms", 1e3 * times[15]);
     }
-    let names = ["one stage", "two stages", "alignment, mesh", "alignment, simplified"];
-    let mut times = [const { Vec::new() }; 4];
+    let names = ["one stage", "two stages", "alignment, mesh", "alignment, simplified", "refiner"];
+    let mut times = [const { Vec::new() }; 5];
     for target in &targets {
         let scene = dataset.scene(target.scene_id)?;
         let frame = scene.image(target.im_id)?;
         let camera = scene.camera(target.im_id)?;
         let Some(image) = scene.rgb(target.im_id)? else { continue };
-        let known = |id: u32| meshes.get(&id).map(|m: &(_, _)| &m.0);
+        let known = |id: u32| meshes.get(&id).map(|m: &(_, _, _)| &m.0);
         let placed: Vec<_> = frame
             .ground_truth
             .iter()
@@ -51,7 +55,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             let (true, Some(region)) = (asked, visible.info.bbox_visib) else {
                 continue;
             };
-            let (mesh, small) = &meshes[&truth.obj_id];
+            let (mesh, small, refined) = &meshes[&truth.obj_id];
             let mut clock =
                 |part: usize, began: Instant| times[part].push(1e3 * began.elapsed().as_secs_f64());
             let began = Instant::now();
@@ -72,6 +76,10 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
                 refine(&image, &camera, mesh, &found, &OutlineRefinementOptions::default());
                 clock(part, began);
             }
+            let Some(best) = found.hypotheses.first() else { continue };
+            let began = Instant::now();
+            refined.refine(&image, &camera, &best.camera_from_object)?;
+            clock(4, began);
         }
     }
     for (name, times) in names.iter().zip(&mut times) {

@@ -2,6 +2,7 @@
 //!
 //! Scores are kept, so that `sixfold eval` compares both files.
 use std::collections::BTreeMap;
+use std::collections::btree_map::Entry;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -17,12 +18,13 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut estimates = read_results(Path::new(results))?;
     let mut objects: BTreeMap<u32, Arc<dyn RefinedObject>> = BTreeMap::new();
     for e in &mut estimates {
-        if !objects.contains_key(&e.obj_id) {
-            objects.insert(e.obj_id, refiner.object(&dataset.model(e.obj_id, Models::Rendering)?));
-        }
+        let object = match objects.entry(e.obj_id) {
+            Entry::Occupied(known) => known.into_mut(),
+            Entry::Vacant(free) => free.insert(refiner.object(&dataset.model(e.obj_id, Models::Rendering)?)),
+        };
         let scene = dataset.scene(e.scene_id)?;
         let Some(image) = scene.rgb(e.im_id)? else { continue };
-        let refined = objects[&e.obj_id].refine(&image, &scene.camera(e.im_id)?, &e.camera_from_object)?;
+        let refined = object.refine(&image, &scene.camera(e.im_id)?, &e.camera_from_object)?;
         if let Some(refined) = refined {
             e.camera_from_object = refined.camera_from_object;
             e.rotation_as_written = None;
