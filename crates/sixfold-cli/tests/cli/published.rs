@@ -75,7 +75,7 @@ fn nol_trains_as_published() {
     assert!(run.json()["losses"]["features"].as_f64().is_some_and(|l| l > 0.0), "{}", run.stdout);
     let card = sixfold_nn::weights::read_card(&dir.path().join("nol/model.safetensors")).unwrap();
     let batch = &card.extra["training"]["batch"];
-    assert_eq!((&batch["min_sources"], &batch["most_sources"]), (&8.into(), &8.into()), "{batch}");
+    assert_eq!((&batch["min_sources"], &batch["max_sources"]), (&8.into(), &8.into()), "{batch}");
 }
 
 #[test]
