@@ -1,4 +1,4 @@
-//! Poses from correspondences: PnP with outliers, Kabsch, Umeyama, ICP.
+//! Poses from correspondences: PnP with outliers, Kabsch, Umeyama and ICP.
 
 use numpy::{PyArray1, PyArray2};
 use pyo3::exceptions::PyValueError;
@@ -30,7 +30,7 @@ fn pnp_error(error: PnpError) -> PyErr {
     PyValueError::new_err(format!("{argument}: {error}"))
 }
 
-/// What `pnp_ransac` finds. Unpacks into camera_from_object (4, 4) and inliers (N,) bool.
+/// The result of `pnp_ransac`. Unpacks into camera_from_object (4, 4) and inliers (N,) bool.
 #[pyclass(name = "PnpResult", module = "sixfold", frozen)]
 pub(crate) struct PnpResult {
     /// The pose, (4, 4) float64, metres.
@@ -39,10 +39,10 @@ pub(crate) struct PnpResult {
     /// Per correspondence, whether its reprojection error is below the threshold; (N,) bool.
     #[pyo3(get)]
     inliers: Py<PyArray1<bool>>,
-    /// How many are.
+    /// Number of inliers.
     #[pyo3(get)]
     inlier_count: usize,
-    /// Samples drawn.
+    /// Number of samples drawn.
     #[pyo3(get)]
     iterations: usize,
     /// Mean of 1 - min(error / threshold, 1)^2 over all correspondences: 0 no support, 1 perfect.
@@ -68,18 +68,23 @@ impl PnpResult {
     }
 }
 
-/// Samples above this are worth a thread that handles Ctrl-C.
+/// With more samples than this, the search runs on a thread of its own, so that Ctrl-C can interrupt it.
 const MANY_ITERATIONS: usize = 20_000;
 
-/// The pose that most correspondences agree with: AP3P (Ke and Roumeliotis 2017) or EPnP (Lepetit et al. 2009) in a
-/// locally optimised RANSAC (Chum et al. 2003; Lebeda et al. 2012), refined over all of them.
+/// Estimates a pose from correspondences with outliers. AP3P (Ke and Roumeliotis 2017) or EPnP (Lepetit et al. 2009) computes
+/// poses in a locally optimised RANSAC (Chum et al. 2003; Lebeda et al. 2012). With refine=True the best pose is refined over all
+/// correspondences.
 ///
-/// object_points (N, 3) metres, image_points (N, 2) pixels of the raw image (a distortion of the camera is undone);
-/// threshold_px: a smaller reprojection error makes an inlier. Returns a PnpResult, which unpacks into the pose (4, 4)
-/// and the inlier mask (N,). The same input and seed give the same bytes.
+/// object_points: (N, 3), metres. image_points: (N, 2), pixels of the raw image; the camera's distortion is removed.
+/// threshold_px: correspondences with a smaller reprojection error are inliers. max_iterations, min_iterations: maximum and
+/// minimum number of samples; min_iterations is 200 by default, but not above max_iterations. confidence: the search ends once a
+/// sample without outliers was drawn with this probability, 0.9999 by default. solver: "ap3p" or "epnp". Ctrl-C interrupts long
+/// searches (max_iterations above 20000, or more than 200000 correspondences).
 ///
-/// Raises ValueError for lists of different lengths, fewer than 4 correspondences, numbers that are not finite, points on
-/// one line; NoSolutionError (a ValueError) when no pose agrees with enough of them.
+/// Returns a PnpResult, which unpacks into the pose (4, 4) and the inlier mask (N,). The same input and seed give the same bytes.
+///
+/// Raises ValueError for lists of different lengths, fewer than 4 correspondences, numbers that are not finite, collinear points
+/// and options out of range; NoSolutionError (a ValueError) when no pose agrees with enough correspondences.
 ///
 /// >>> import numpy as np
 /// >>> camera = Camera(572.4, 573.6, 325.3, 242.0, 640, 480)
@@ -145,10 +150,11 @@ pub(crate) fn pnp_ransac(
     })
 }
 
-/// The pose (4, 4) that EPnP (Lepetit et al. 2009) finds for at least four correspondences without outliers:
-/// object_points (N, 3) metres, image_points (N, 2) pixels of the raw image.
+/// Computes a pose (4, 4) by EPnP (Lepetit et al. 2009) from at least four correspondences without outliers.
 ///
-/// Raises ValueError as pnp_ransac.
+/// object_points: (N, 3), metres. image_points: (N, 2), pixels of the raw image.
+///
+/// Raises ValueError as pnp_ransac; NoSolutionError when EPnP finds no pose.
 ///
 /// >>> import numpy as np
 /// >>> points = np.array([[0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1], [0.1, 0.1, 0.1], [0, 0, 0]])
@@ -168,8 +174,10 @@ pub(crate) fn epnp<'py>(
     arrays::from_pose(py, &pose)
 }
 
-/// Refines `initial` (4, 4) over all correspondences, outliers included, by truncated least squares (Blake and Zisserman
-/// 1987): reprojection errors beyond threshold_px have no influence. Returns the pose (4, 4) and the number of inliers.
+/// Refines the pose `initial` (4, 4) by truncated least squares (Blake and Zisserman 1987). All correspondences are used, outliers
+/// included, but reprojection errors above threshold_px have no influence.
+///
+/// Returns the pose (4, 4) and the number of inliers.
 ///
 /// Raises ValueError as pnp_ransac; NoSolutionError when fewer than three correspondences are within the threshold.
 ///
@@ -213,7 +221,7 @@ fn alignment_error(error: AlignmentError) -> PyErr {
     PyValueError::new_err(format!("{argument}: {error}"))
 }
 
-/// Source and target points, and their weights.
+/// Source points, target points and their weights.
 type Pairs = (Vec<sixfold::geometry::Vec3>, Vec<sixfold::geometry::Vec3>, Option<Vec<f64>>);
 
 fn pairs(
@@ -227,11 +235,13 @@ fn pairs(
     Ok((source, target, weights))
 }
 
-/// The rigid transformation target_from_source (4, 4) that minimises the weighted squared distances (Kabsch 1976,
-/// reflections after Umeyama 1991): source and target (N, 3), weights (N,) or None for equal ones.
+/// Computes the rigid transformation target_from_source (4, 4) that minimises the weighted squared distances (Kabsch 1976,
+/// reflections after Umeyama 1991).
 ///
-/// Raises ValueError for different lengths, negative weights, or points that do not fix a rotation (fewer than three, or
-/// on one line).
+/// source, target: (N, 3). weights: (N,), or None for equal weights.
+///
+/// Raises ValueError for different lengths, negative weights, or points that do not determine a rotation (fewer than three, or
+/// collinear).
 ///
 /// >>> import numpy as np
 /// >>> points = np.random.default_rng(0).normal(size=(10, 3))
@@ -251,8 +261,9 @@ pub(crate) fn kabsch<'py>(
     arrays::from_pose(py, &pose)
 }
 
-/// The similarity that minimises the weighted squared distances (Umeyama 1991, equations 40 to 42): target_from_source
-/// (4, 4) without the scale, and the scale, so that target = R (scale * source) + t.
+/// Computes the similarity transformation that minimises the weighted squared distances (Umeyama 1991, equations 40 to 42).
+///
+/// Returns target_from_source (4, 4) without the scale, and the scale: target = R (scale * source) + t.
 ///
 /// Raises ValueError as kabsch.
 ///
@@ -275,19 +286,19 @@ pub(crate) fn umeyama<'py>(
     Ok((arrays::from_pose(py, &found.target_from_source)?, found.scale))
 }
 
-/// What ICP finds. Unpacks into target_from_source (4, 4) and rms.
+/// The result of ICP. Unpacks into target_from_source (4, 4) and rms.
 #[pyclass(name = "IcpResult", module = "sixfold", frozen)]
 pub(crate) struct IcpResult {
     /// The pose that maps the source onto the target, (4, 4) float64.
     #[pyo3(get)]
     target_from_source: Py<PyArray2<f64>>,
-    /// Root mean square of the point-to-plane distances of the pairs, metres.
+    /// Root mean square of the point-to-plane distances in the last iteration, metres.
     #[pyo3(get)]
     rms: f64,
-    /// Pairs in the last iteration.
+    /// Number of pairs in the last iteration.
     #[pyo3(get)]
     inliers: usize,
-    /// Iterations over all levels.
+    /// Number of iterations over all levels.
     #[pyo3(get)]
     iterations: usize,
     /// Whether the last level ended because its steps became small.
@@ -337,7 +348,7 @@ fn icp_result(py: Python<'_>, report: Result<IcpReport, IcpError>) -> PyResult<I
     })
 }
 
-/// The levels of a schedule: a rejection distance, or `[(metres, iterations, stride), ...]`.
+/// The options of ICP, with levels from a rejection distance or from `[(metres, iterations, stride), ...]`.
 fn icp_options(
     rejection_distance: f64,
     levels: Option<&Bound<'_, PyAny>>,
@@ -379,7 +390,7 @@ fn cloud(
             if normals.len() != list.len() {
                 return Err(bad(
                     argument,
-                    format!("{} normals, one a point", list.len()),
+                    format!("{} normals, one per point", list.len()),
                     normals.len().to_string(),
                 ));
             }
@@ -392,16 +403,16 @@ fn cloud(
     Ok(PointCloud { points: list, normals })
 }
 
-/// Aligns source points (N, 3) with target points (M, 3) that have normals (M, 3): point-to-plane ICP from coarse to fine
-/// (Chen and Medioni 1992) with Tukey's weights; metres. Needs a start, `initial` target_from_source (4, 4), that is off by
-/// less than about the rejection distance.
+/// Aligns points with a target cloud by coarse-to-fine point-to-plane ICP (Chen and Medioni 1992) with Tukey's weights.
 ///
-/// rejection_distance: pairs further apart are left out on the first level, half and a quarter of it on the next; levels
-/// [(metres, iterations, stride), ...] replaces that schedule. With source_normals, normals of a pair agree within
-/// max_angle radians. Ctrl-C is heard.
+/// source: (N, 3), metres. target: (M, 3), metres; target_normals: (M, 3). initial: the start, target_from_source (4, 4),
+/// the identity by default; its error must be below about the rejection distance. rejection_distance: pairs further apart than
+/// this are left out, metres; half of it on the second level, a quarter on the third. levels: [(metres, iterations, stride), ...]
+/// instead of this schedule, where only every stride-th source point is used. source_normals: (N, 3); if given, the normals of a
+/// pair must agree within max_angle radians. Ctrl-C interrupts it.
 ///
-/// Raises ValueError for arrays of different lengths or numbers that are not finite; NoSolutionError when too few points
-/// find a partner or the surface lets the object slide.
+/// Raises ValueError for arrays of different lengths or numbers that are not finite; NoSolutionError when too few points have a
+/// correspondence, or when the surface does not determine the pose (the object can slide on it).
 ///
 /// >>> import numpy as np
 /// >>> normals = np.random.default_rng(0).normal(size=(2000, 3))
@@ -436,10 +447,10 @@ pub(crate) fn icp(
     icp_result(py, report)
 }
 
-/// As icp with a depth image (H, W) in metres as the target: a point's partner is what its pixel shows (Blais and Levine
-/// 1995). The source is in the object's frame, the result is camera_from_object.
+/// Aligns points with a depth image (H, W) in metres, as icp does with a cloud. A point corresponds to the surface at its pixel
+/// (Blais and Levine 1995). The source is in the object's frame; target_from_source of the result is camera_from_object.
 ///
-/// Raises ValueError when depth and camera differ in size; NoSolutionError as icp.
+/// Raises ValueError when depth and camera differ in size or the camera has distortion; NoSolutionError as icp.
 ///
 /// >>> seen = render(mesh, start, camera)  # doctest: +SKIP
 /// >>> icp_to_depth(seen.coordinates[seen.mask], depth, camera, start).target_from_source  # doctest: +SKIP

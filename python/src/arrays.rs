@@ -1,7 +1,7 @@
-//! numpy arrays to checked values and back. What comes in is copied once, because the interpreter lock is released while
-//! we read it and another thread could write to it meanwhile; images and masks are handed over without a copy.
+//! Conversion of numpy arrays to checked values and back. Input is copied once, because the interpreter lock is released while
+//! it is used, and another thread could write to it meanwhile. Images and masks are returned without a copy.
 //!
-//! Every refusal is a `ValueError` with the argument's name, what was expected and what was found.
+//! Every invalid value raises a `ValueError` with the argument's name, what was expected and what was found.
 
 use numpy::PyUntypedArrayMethods;
 use numpy::{
@@ -16,17 +16,17 @@ use sixfold::geometry::{
     DepthImage, Image, Mask, Mat3, NormalImage, PointImage, Pose, Rect, RgbImage, Vec2, Vec3,
 };
 
-/// A `ValueError` in the form that all arguments use.
+/// A `ValueError` in the common form of all arguments.
 pub(crate) fn bad(argument: &str, expected: impl AsRef<str>, found: impl AsRef<str>) -> PyErr {
     PyValueError::new_err(format!("{argument}: expected {}, found {}", expected.as_ref(), found.as_ref()))
 }
 
-/// A `ValueError` that puts the argument's name before what the library says.
+/// A `ValueError` with the argument's name before the library's message.
 pub(crate) fn about<E: std::fmt::Display>(argument: &'static str) -> impl Fn(E) -> PyErr {
     move |error| PyValueError::new_err(format!("{argument}: {error}"))
 }
 
-/// A whole number of at least `minimum`.
+/// A whole number from `minimum`.
 pub(crate) fn whole(argument: &str, value: i64, minimum: i64) -> PyResult<usize> {
     if value < minimum {
         return Err(bad(argument, format!("a whole number from {minimum}"), value.to_string()));
@@ -34,17 +34,17 @@ pub(crate) fn whole(argument: &str, value: i64, minimum: i64) -> PyResult<usize>
     usize::try_from(value).map_err(|_| bad(argument, "a smaller number", value.to_string()))
 }
 
-/// A seed.
+/// A seed, from 0.
 pub(crate) fn seed(value: i64) -> PyResult<u64> {
     whole("seed", value, 0).map(|s| s as u64)
 }
 
-/// An id of a scene, image or object.
+/// The id of a scene, image or object.
 pub(crate) fn id(argument: &str, value: i64) -> PyResult<u32> {
     u32::try_from(value).map_err(|_| bad(argument, "an id from 0 to 4294967295", value.to_string()))
 }
 
-/// Scenes with images.
+/// Pairs of scene and image id.
 pub(crate) fn pairs(argument: &str, list: &Bound<'_, PyAny>) -> PyResult<Vec<(u32, u32)>> {
     let pairs: Vec<(i64, i64)> = list
         .extract()
@@ -60,7 +60,7 @@ pub(crate) fn positive(argument: &str, value: f64) -> PyResult<f64> {
     Err(bad(argument, "a finite number above zero", value.to_string()))
 }
 
-/// What an argument may hold: numpy's kinds, the type it is turned into, and its name in messages.
+/// The permitted type of an argument: numpy's kinds, the type it is converted to, and its name in messages.
 struct Type {
     kinds: &'static [u8],
     dtype: &'static str,
@@ -92,7 +92,7 @@ fn shape_words(shape: &[Option<usize>]) -> String {
     if words.len() == 1 { format!("({},)", words[0]) } else { format!("({})", words.join(", ")) }
 }
 
-/// The values of an array or of what numpy makes an array of, row by row.
+/// The values, row by row, of an array or of an object that numpy converts to one.
 fn read<T: Element + Copy>(
     argument: &str,
     object: &Bound<'_, PyAny>,
@@ -113,7 +113,7 @@ fn read<T: Element + Copy>(
     let found: Vec<usize> = array.shape().to_vec();
     let fits = found.len() == shape.len() && found.iter().zip(shape).all(|(f, s)| s.is_none_or(|s| s == *f));
     let kind = array.dtype().kind();
-    // An empty list is an array of float64; there is nothing in it that could be of a wrong kind.
+    // numpy makes a float64 array of an empty list; it has no value that could be of a wrong kind.
     let empty = found.contains(&0) && fits;
     if !fits || !(of.kinds.contains(&kind) || empty) || (of.dtype == "uint8" && array.dtype().itemsize() != 1)
     {
@@ -157,7 +157,7 @@ pub(crate) fn points2(argument: &str, object: &Bound<'_, PyAny>) -> PyResult<Vec
     Ok(numbers.values.as_chunks::<2>().0.iter().map(|p| Vector2::from(*p)).collect())
 }
 
-/// `(N, 2)` numbers that may be anything, for texture coordinates.
+/// `(N, 2)` finite numbers of any range, for texture coordinates.
 pub(crate) fn pairs_f32(argument: &str, object: &Bound<'_, PyAny>) -> PyResult<Vec<[f32; 2]>> {
     let numbers = read::<f64>(argument, object, &REAL, &[None, Some(2)])?;
     finite(argument, &numbers)?;
@@ -185,14 +185,14 @@ pub(crate) fn matrix3(argument: &str, object: &Bound<'_, PyAny>) -> PyResult<Mat
     Ok(Mat3::from_row_slice(&numbers.values))
 }
 
-/// A `(4, 4)` pose, its rotation made exact.
+/// A `(4, 4)` pose; its rotation is replaced by the nearest exact one.
 pub(crate) fn pose(argument: &'static str, object: &Bound<'_, PyAny>) -> PyResult<Pose> {
     let numbers = read::<f64>(argument, object, &REAL, &[Some(4), Some(4)])?;
     finite(argument, &numbers)?;
     Pose::from_matrix(&Matrix4::from_row_slice(&numbers.values)).map_err(about(argument))
 }
 
-/// A `(4, 4)` pose with its rotation as it is: what errors are computed with, as the official toolkit does.
+/// A `(4, 4)` pose with its rotation unchanged. Errors are computed with it, as the official BOP toolkit does.
 pub(crate) fn placement(argument: &'static str, object: &Bound<'_, PyAny>) -> PyResult<Placement> {
     pose(argument, object)?;
     let v = read::<f64>(argument, object, &REAL, &[Some(4), Some(4)])?.values;
@@ -225,13 +225,13 @@ fn image<T>(argument: &str, shape: &[usize], values: Vec<T>) -> PyResult<Image<T
         .map_err(|error| PyValueError::new_err(format!("{argument}: {error}")))
 }
 
-/// `(H, W)` depth in metres; anything not finite and positive is missing.
+/// `(H, W)` depth in metres; values that are not finite and positive are missing.
 pub(crate) fn depth(argument: &str, object: &Bound<'_, PyAny>) -> PyResult<DepthImage> {
     let numbers = read::<f32>(argument, object, &METRES, &[None, None])?;
     image(argument, &numbers.shape, numbers.values)
 }
 
-/// `(H, W, 3)` colour.
+/// `(H, W, 3)` colour image.
 pub(crate) fn rgb(argument: &str, object: &Bound<'_, PyAny>) -> PyResult<RgbImage> {
     let numbers = read::<u8>(argument, object, &COLOR, &[None, None, Some(3)])?;
     image(argument, &numbers.shape, numbers.values.as_chunks::<3>().0.to_vec())
@@ -273,7 +273,7 @@ pub(crate) fn ids(argument: &str, object: &Bound<'_, PyAny>) -> PyResult<Vec<u32
     read::<i64>(argument, object, &WHOLE, &[None])?.values.into_iter().map(|v| id(argument, v)).collect()
 }
 
-/// `(N, 4)` boxes `x, y, width, height` in pixels; one box alone may be `(4,)`.
+/// `(N, 4)` boxes `x, y, width, height` in pixels; a single box may be `(4,)`.
 pub(crate) fn boxes(argument: &str, object: &Bound<'_, PyAny>) -> PyResult<Vec<Rect>> {
     let numbers = match read::<f64>(argument, object, &REAL, &[Some(4)]) {
         Ok(one) => one,
@@ -324,7 +324,7 @@ pub(crate) fn from_pose<'py>(py: Python<'py>, pose: &Pose) -> PyResult<Bound<'py
     rows(py, pose_values(pose).to_vec(), 4)
 }
 
-/// `(4, 4)`, the rotation as it is.
+/// `(4, 4)`, with the rotation unchanged.
 pub(crate) fn from_placement<'py>(
     py: Python<'py>,
     placement: &Placement,

@@ -1,5 +1,5 @@
-//! `sixfold.bop`: datasets, result files and single images of the BOP format. Files hold millimetres; everything here is
-//! in metres unless its name says `mm`.
+//! `sixfold.bop`: datasets, result files and single images in the BOP format. Files are in millimetres; everything here is in
+//! metres unless its name contains `mm`.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -16,7 +16,7 @@ use crate::camera::PyCamera;
 use crate::guard::{dataset_error, free, image_error, results_error};
 use crate::mesh::PyMesh;
 
-/// What serialises, as dicts, lists and numbers.
+/// Converts a serialisable value to Python's dicts, lists and numbers.
 pub(crate) fn json_to_python<'py>(
     py: Python<'py>,
     value: &impl serde::Serialize,
@@ -27,9 +27,10 @@ pub(crate) fn json_to_python<'py>(
 
 /// An estimated pose of an object in an image: a row of a result file.
 ///
-/// camera_from_object (4, 4), metres; score: higher is surer; time: seconds for the whole image, None where not measured.
+/// camera_from_object: (4, 4), metres. score: the confidence; higher is more confident. time: seconds for the whole image, or
+/// None if not measured.
 ///
-/// Raises ValueError for ids below zero, a score that is not finite, a pose that is none.
+/// Raises ValueError for an id below 0, a score that is not finite, a negative time, or an invalid pose.
 ///
 /// >>> import numpy as np
 /// >>> from sixfold import bop
@@ -68,43 +69,43 @@ impl PyEstimate {
         Ok(PyEstimate(estimate))
     }
 
-    /// The scene.
+    /// The scene's id.
     #[getter]
     fn scene_id(&self) -> u32 {
         self.0.scene_id
     }
 
-    /// The image.
+    /// The image's id in its scene.
     #[getter]
     fn im_id(&self) -> u32 {
         self.0.im_id
     }
 
-    /// The object.
+    /// The object's id.
     #[getter]
     fn obj_id(&self) -> u32 {
         self.0.obj_id
     }
 
-    /// Confidence, higher is surer.
+    /// The confidence; higher is more confident.
     #[getter]
     fn score(&self) -> f64 {
         self.0.score
     }
 
-    /// Seconds for the whole image, or None.
+    /// Seconds for the whole image, or None if not measured.
     #[getter]
     fn time(&self) -> Option<f64> {
         self.0.time
     }
 
-    /// The pose, (4, 4) float64, metres; its rotation is the one nearest to what was written.
+    /// The pose, (4, 4) float64, metres; its rotation is the exact one nearest to the rotation as written.
     #[getter]
     fn camera_from_object<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
         arrays::from_pose(py, &self.0.camera_from_object)
     }
 
-    /// The pose with the rotation as it was written, (4, 4): what the scores are computed with.
+    /// The pose with the rotation as written, (4, 4) float64, metres. Scores are computed with it.
     #[getter]
     fn camera_from_object_as_written<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
         arrays::from_placement(py, &self.0.placement())
@@ -116,10 +117,11 @@ impl PyEstimate {
     }
 }
 
-/// Reads a result file of the BOP Challenge (scene_id,im_id,obj_id,score,R,t,time; t in millimetres): a list of Estimate.
-/// lenient=True leaves broken rows out and warns.
+/// Reads a result file of the BOP Challenge (scene_id,im_id,obj_id,score,R,t,time; t in millimetres).
 ///
-/// Raises OSError when the file cannot be read, ValueError with line and column for a broken row.
+/// lenient=True leaves invalid rows out and warns. Returns a list of Estimate.
+///
+/// Raises OSError when the file cannot be read; ValueError with line and column for an invalid row.
 ///
 /// >>> estimates = read_results("results.csv")  # doctest: +SKIP
 #[pyfunction]
@@ -138,7 +140,9 @@ fn read_results(py: Python<'_>, path: PathBuf, lenient: bool) -> PyResult<Vec<Py
     Ok(estimates.into_iter().map(PyEstimate).collect())
 }
 
-/// Writes a result file of the BOP Challenge, all or nothing. Raises OSError when it cannot be written.
+/// Writes a result file of the BOP Challenge, completely or not at all.
+///
+/// Raises OSError when it cannot be written.
 ///
 /// >>> write_results("results.csv", estimates)  # doctest: +SKIP
 #[pyfunction]
@@ -147,7 +151,7 @@ fn write_results(py: Python<'_>, path: PathBuf, estimates: Vec<PyEstimate>) -> P
     free(py, || sixfold::bop::write_results(&path, &rows))?.map_err(results_error)
 }
 
-/// A pose (4, 4) in metres from a rotation (3, 3) and a translation (3,) in millimetres, as BOP files have them.
+/// Converts a rotation (3, 3) and a translation (3,) in millimetres, as in BOP files, to a pose (4, 4) in metres.
 ///
 /// >>> import numpy as np
 /// >>> pose_from_mm(np.eye(3), [0, 0, 1000])[2, 3]
@@ -164,7 +168,7 @@ fn pose_from_mm<'py>(
     arrays::from_placement(py, &Placement { rotation, translation })
 }
 
-/// Rotation (3, 3) and translation (3,) in millimetres, as BOP files have them, of a pose (4, 4) in metres.
+/// Converts a pose (4, 4) in metres to a rotation (3, 3) and a translation (3,) in millimetres, as in BOP files.
 ///
 /// >>> import numpy as np
 /// >>> pose_to_mm(np.diag([1.0, 1, 1, 1]))[1]
@@ -180,10 +184,12 @@ fn pose_to_mm<'py>(
     Ok((arrays::from_matrix3(py, &placement.rotation)?, arrays::from_vector3(py, &millimetres)))
 }
 
-/// A BOP dataset on disk: `path/split` with scene folders, `path/models` and the text files around them. `path` may be a
-/// scene folder itself.
+/// A BOP dataset on disk.
 ///
-/// Raises FileNotFoundError when folder, split or scenes are missing, ValueError when a file is broken.
+/// path: the dataset's folder, with scene folders in `path/split`, models in `path/models`, and their text files; or a single
+/// scene folder.
+///
+/// Raises FileNotFoundError when the folder, the split or its scenes are missing; ValueError when a file is invalid.
 ///
 /// >>> from sixfold import bop
 /// >>> dataset = bop.Dataset("data/demo")  # doctest: +SKIP
@@ -197,7 +203,7 @@ impl PyDataset {
         self.0.scene(id("scene_id", scene_id)?).map_err(dataset_error)
     }
 
-    /// All images, as scene and number.
+    /// All images, as pairs of scene and image id.
     pub(crate) fn images(&self) -> PyResult<Vec<(u32, u32)>> {
         let mut images = vec![];
         for scene_id in self.0.scene_ids() {
@@ -223,18 +229,18 @@ impl PyDataset {
         self.0.root().to_owned()
     }
 
-    /// The scenes of the split, ascending.
+    /// Ids of the split's scenes, ascending.
     #[getter]
     fn scene_ids(&self) -> Vec<u32> {
         self.0.scene_ids()
     }
 
-    /// The images of a scene, ascending.
+    /// Ids of a scene's images, ascending.
     fn image_ids(&self, scene_id: i64) -> PyResult<Vec<u32>> {
         Ok(self.scene(scene_id)?.image_ids())
     }
 
-    /// The objects that models_info.json names, ascending.
+    /// Ids of the objects in models_info.json, ascending; empty without this file.
     #[getter]
     fn object_ids(&self) -> PyResult<Vec<u32>> {
         let infos = self.0.models_info(Models::Rendering).map_err(dataset_error)?;
@@ -246,7 +252,7 @@ impl PyDataset {
         Ok(PyCamera(self.scene(scene_id)?.camera(id("im_id", im_id)?).map_err(dataset_error)?))
     }
 
-    /// The colour image, (H, W, 3) uint8, or None where there is none.
+    /// The colour image, (H, W, 3) uint8, or None if there is none.
     fn rgb<'py>(
         &self,
         py: Python<'py>,
@@ -258,7 +264,7 @@ impl PyDataset {
         image.map(|i| arrays::from_image_of(py, i)).transpose()
     }
 
-    /// The depth image, (H, W) float32 metres, 0 where nothing was measured; None where there is none.
+    /// The depth image, (H, W) float32 metres, 0 where nothing was measured; None if there is no image.
     fn depth<'py>(
         &self,
         py: Python<'py>,
@@ -270,8 +276,8 @@ impl PyDataset {
         image.map(|i| arrays::from_image(py, i)).transpose()
     }
 
-    /// The mask (H, W) bool of ground-truth pose number `index`: what is visible, or with visible=False the whole
-    /// silhouette; None where there is none.
+    /// The mask of ground-truth pose number `index` (from 0), (H, W) bool: its visible part, or with visible=False its whole
+    /// silhouette; None if there is no mask.
     #[pyo3(signature = (scene_id, im_id, index, *, visible=true))]
     fn mask<'py>(
         &self,
@@ -287,8 +293,8 @@ impl PyDataset {
         image.map(|i| arrays::from_image(py, i)).transpose()
     }
 
-    /// The ground truth of an image: a list of dicts with obj_id, camera_from_object (4, 4) in metres, visible (fraction or
-    /// None), box and box_visible (x, y, width, height in pixels, or None).
+    /// The ground truth of an image: a list of dicts with obj_id, camera_from_object (4, 4) in metres, visible (the visible
+    /// fraction, or None), box and box_visible (x, y, width, height in pixels, or None).
     fn ground_truth<'py>(&self, py: Python<'py>, scene_id: i64, im_id: i64) -> PyResult<Bound<'py, PyList>> {
         let scene = self.scene(scene_id)?;
         let image = scene.image(id("im_id", im_id)?).map_err(dataset_error)?;
@@ -309,8 +315,10 @@ impl PyDataset {
         Ok(out)
     }
 
-    /// What has to be found: (scene_id, im_id, obj_id, count) from a targets file, test_targets_bop19.json, or every pose
-    /// at least 10 % visible.
+    /// The targets, the objects to be found: a list of (scene_id, im_id, obj_id, count).
+    ///
+    /// path: a targets file. Without it, test_targets_bop19.json is read; without that file too, the targets are all ground-truth
+    /// poses that are at least 10 % visible or of unknown visibility.
     #[pyo3(signature = (path=None))]
     fn targets(&self, path: Option<PathBuf>) -> PyResult<Vec<(u32, u32, u32, usize)>> {
         let targets = self.0.targets(path.as_deref()).map_err(dataset_error)?;
@@ -321,8 +329,8 @@ impl PyDataset {
             .collect())
     }
 
-    /// The model of an object as a Mesh in metres with the symmetries of models_info.json; evaluation=True takes that of
-    /// models_eval where there is one.
+    /// The model of an object: a Mesh in metres with the symmetries of models_info.json. evaluation=True takes the model from
+    /// models_eval if the dataset has this folder.
     #[pyo3(signature = (obj_id, *, evaluation=false))]
     fn model(&self, py: Python<'_>, obj_id: i64, evaluation: bool) -> PyResult<PyMesh> {
         let (obj_id, dataset) = (id("obj_id", obj_id)?, &self.0);
@@ -337,7 +345,7 @@ impl PyDataset {
     }
 }
 
-/// Sets the largest image that is read from a file, in pixels, for everything in this process: 100 million unless it is set.
+/// Sets the maximum number of pixels of an image that is read from a file, for the whole process; 100 million by default.
 ///
 /// Raises ValueError for a limit below 1.
 ///
@@ -348,7 +356,9 @@ fn set_max_pixels(pixels: i64) -> PyResult<()> {
     Ok(())
 }
 
-/// Reads a colour image (grey ones as colour): (H, W, 3) uint8. Raises OSError or ValueError.
+/// Reads a colour image, PNG or JPEG: (H, W, 3) uint8. A grey image is converted to colour.
+///
+/// Raises OSError when the file cannot be read; ValueError when it is not such an image.
 ///
 /// >>> rgb = read_rgb("data/demo/test/000002/rgb/000003.png")  # doctest: +SKIP
 #[pyfunction]
@@ -357,9 +367,11 @@ fn read_rgb(py: Python<'_>, path: PathBuf) -> PyResult<Bound<'_, PyArray3<u8>>> 
     arrays::from_image_of(py, image)
 }
 
-/// Reads a 16 bit depth image: (H, W) float32 metres. mm_per_unit is BOP's depth_scale, the millimetres of one step.
+/// Reads a 16-bit depth image: (H, W) float32 metres.
 ///
-/// Raises OSError when the file cannot be read, ValueError when it is no such image.
+/// mm_per_unit: millimetres per unit of the file, BOP's depth_scale.
+///
+/// Raises OSError when the file cannot be read; ValueError when it is not such an image.
 ///
 /// >>> depth = read_depth("data/demo/test/000002/depth/000003.png", mm_per_unit=1.0)  # doctest: +SKIP
 #[pyfunction]
@@ -369,10 +381,12 @@ fn read_depth(py: Python<'_>, path: PathBuf, mm_per_unit: f64) -> PyResult<Bound
     arrays::from_image(py, image)
 }
 
-/// Reads a mask: (H, W) bool, True where the file is not zero. Grey, a palette, or RGB with one colour besides black; alpha that
-/// is not full everywhere is the mask.
+/// Reads a mask: (H, W) bool, True where the file is not zero.
 ///
-/// Raises OSError when the file cannot be read, ValueError when it is no such image, or when it could mean two things.
+/// The file is grey, has a palette, or is RGB with one colour besides black. An alpha channel that is not opaque everywhere is
+/// the mask itself.
+///
+/// Raises OSError when the file cannot be read; ValueError when it is not such an image (a JPEG never is) or is ambiguous.
 ///
 /// >>> mask = read_mask("mask.png")  # doctest: +SKIP
 #[pyfunction]
@@ -392,7 +406,9 @@ fn write_rgb(py: Python<'_>, path: PathBuf, rgb: &Bound<'_, PyAny>) -> PyResult<
     free(py, || sixfold::io::write_rgb(&path, &image))?.map_err(image_error)
 }
 
-/// Writes a depth image (H, W) in metres as 16 bit PNG in steps of mm_per_unit millimetres (BOP's depth_scale).
+/// Writes a depth image (H, W) in metres as a 16-bit PNG.
+///
+/// mm_per_unit: millimetres per unit of the file, BOP's depth_scale. Values that do not fit are stored as missing (0).
 ///
 /// Raises OSError when the file cannot be written.
 ///
@@ -415,11 +431,15 @@ fn write_mask(py: Python<'_>, path: PathBuf, mask: &Bound<'_, PyAny>) -> PyResul
     free(py, || sixfold::io::write_mask(&path, &image))?.map_err(image_error)
 }
 
-/// Masks and visibility of posed objects, [(mesh, camera_from_object (4, 4)), ...], as BOP's ground-truth info: a list of
-/// dicts with mask and mask_visible (H, W) bool and visible (fraction). depth (H, W) metres is the sensor's image, where
-/// there is one; delta the tolerance of the visibility test in metres.
+/// Computes masks and visibility of posed objects as BOP's ground truth does.
 ///
-/// Raises ValueError for a depth image of another size than the camera's, no object.
+/// objects: [(mesh, camera_from_object (4, 4)), ...]. depth: the sensor's image, (H, W), metres, if there is one. delta: tolerance
+/// of the visibility test, metres; a surface counts as visible up to this far behind the measured depth.
+///
+/// Returns a list of dicts with mask (the whole silhouette) and mask_visible, both (H, W) bool, and visible (the visible
+/// fraction).
+///
+/// Raises ValueError without objects, or for a depth image of another size than the camera's.
 ///
 /// >>> ground_truth_visibility([(mesh, pose)], camera, depth)[0]["visible"]  # doctest: +SKIP
 #[pyfunction]
@@ -454,7 +474,7 @@ fn ground_truth_visibility<'py>(
     Ok(out)
 }
 
-/// A mask (H, W) bool as COCO's compressed run lengths: a dict with size [H, W] and counts.
+/// Encodes a mask (H, W) bool as COCO's compressed run lengths: a dict with size [H, W] and counts.
 ///
 /// >>> import numpy as np
 /// >>> encode_mask(np.array([[False, True]]))
@@ -469,9 +489,11 @@ pub(crate) fn encode_mask<'py>(py: Python<'py>, mask: &Bound<'py, PyAny>) -> PyR
     Ok(out)
 }
 
-/// The mask (H, W) bool of COCO's run lengths: a dict with size [H, W] and counts, text (compressed) or a list.
+/// Decodes COCO's run lengths to a mask (H, W) bool.
 ///
-/// Raises ValueError when the counts are damaged or do not add up to the size.
+/// rle: a dict with size [H, W] and counts, a text (compressed) or a list of numbers.
+///
+/// Raises ValueError when the counts are invalid or do not add up to the size.
 ///
 /// >>> decode_mask({"size": [1, 2], "counts": [1, 1]})
 /// array([[False,  True]])
@@ -499,7 +521,7 @@ pub(crate) fn decode_mask<'py>(
     arrays::from_image(py, rle.map_err(about("rle"))?.decode())
 }
 
-/// Adds what is in `sixfold.bop`.
+/// Adds the contents of `sixfold.bop`.
 pub(crate) fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<PyEstimate>()?;
     module.add_class::<PyDataset>()?;

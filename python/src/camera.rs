@@ -1,4 +1,4 @@
-//! `Camera`: pinhole intrinsics with an optional lens distortion, and the images that belong to it.
+//! `Camera`: pinhole intrinsics with optional lens distortion, and removal of the distortion from images.
 
 use std::path::PathBuf;
 
@@ -11,14 +11,14 @@ use sixfold::io::CameraFile;
 use crate::arrays::{self, about, bad, whole};
 use crate::guard::{camera_file_error, free};
 
-/// A pinhole camera: focal lengths and principal point in pixels, image size in pixels. The centre of the top left
-/// pixel is (0, 0); x runs right, y down, z forward (OpenCV's frame).
+/// A pinhole camera with focal lengths, principal point and image size in pixels. The centre of the top left pixel is (0, 0);
+/// x points right, y down, z forward (OpenCV's frame).
 ///
-/// `distortion` are Brown's coefficients in OpenCV's order: (k1, k2, p1, p2) or (k1, k2, p1, p2, k3).
+/// distortion: Brown's coefficients in OpenCV's order, (k1, k2, p1, p2) or (k1, k2, p1, p2, k3).
 ///
-/// Raises ValueError for what no lens has: a focal length that is not above zero or not in pixels (an edge of the image more
-/// than 85 degrees off the optical axis), fx and fy that differ by more than a factor of 2, an empty image, numbers that are not
-/// finite.
+/// Raises ValueError for parameters that no real lens has: a focal length that is not above 0, above 1000000 pixels or not in
+/// pixels (an edge of the image is more than 85 degrees off the optical axis); fx and fy that differ by more than a factor of 2; a
+/// distortion that moves an edge of the image by more than a factor of 5; an empty image; numbers that are not finite.
 ///
 /// >>> camera = Camera(572.4, 573.6, 325.3, 242.0, 640, 480)
 /// >>> camera.matrix[0].tolist()
@@ -27,17 +27,17 @@ use crate::guard::{camera_file_error, free};
 #[derive(Clone, Copy, PartialEq)]
 pub(crate) struct PyCamera(pub(crate) Camera);
 
-/// Largest image that is rendered: 64 megapixels.
+/// Maximum number of pixels of a rendered image: 64 megapixels.
 const MAX_PIXELS: u64 = 1 << 26;
 
 impl PyCamera {
-    /// A camera that a lens can have.
+    /// The camera, or an error if no real lens has its parameters.
     fn checked(camera: Camera) -> PyResult<Self> {
         camera.check_lens().map_err(|error| pyo3::exceptions::PyValueError::new_err(error.to_string()))?;
         Ok(PyCamera(camera))
     }
 
-    /// The camera, or an error where only images without distortion are taken.
+    /// The camera, or an error if it has lens distortion.
     pub(crate) fn pinhole(&self) -> PyResult<Camera> {
         if self.0.distortion.is_some() {
             return Err(bad(
@@ -49,21 +49,21 @@ impl PyCamera {
         Ok(self.0)
     }
 
-    /// The camera, or an error where an image of its size would not fit the memory: that would end the interpreter.
+    /// The camera, or an error if its image is too large to be rendered: running out of memory would end the interpreter.
     pub(crate) fn drawable(&self) -> PyResult<Camera> {
         let pixels = self.0.width as u64 * self.0.height as u64;
         if pixels > MAX_PIXELS {
             let found = format!("{} x {}", self.0.width, self.0.height);
             return Err(bad(
                 "camera",
-                format!("an image of at most {MAX_PIXELS} pixels to draw into"),
+                format!("an image of at most {MAX_PIXELS} pixels for rendering"),
                 found,
             ));
         }
         Ok(self.0)
     }
 
-    /// The camera for an image of this size.
+    /// The camera, or an error if it has lens distortion or its image is not of this size.
     pub(crate) fn of_image(&self, argument: &'static str, size: (usize, usize)) -> PyResult<Camera> {
         let camera = self.pinhole()?;
         camera.check_image(size.0, size.1).map_err(about(argument))?;
@@ -101,14 +101,16 @@ impl PyCamera {
         PyCamera::checked(camera)
     }
 
-    /// Reads a camera file: fx, fy, cx, cy or a matrix, and perhaps width, height, distortion and depth_scale, as BOP, OpenCV
-    /// (YAML, XML, JSON) and ROS (CameraInfo, calibration files) write them, or a scene_camera.json of one image. `width` and
-    /// `height` are those of the image, pixels; they may be left out when the file says them. Returns the camera and the file's
-    /// depth_scale, millimetres per unit of the depth image, None without one.
+    /// Reads a camera file. It holds fx, fy, cx, cy or a matrix, and optionally width, height, distortion and depth_scale, as
+    /// written by BOP, OpenCV (YAML, XML, JSON) and ROS (CameraInfo, calibration files); or it is a scene_camera.json of one
+    /// image.
     ///
-    /// Raises OSError when the file cannot be read; ValueError, with the file and field, when it is broken, states another
-    /// size or a key that is unknown, has a fisheye lens, or is no camera of a whole image of that size: a wrong unit, another
-    /// resolution.
+    /// width, height: the image's size in pixels; not needed if the file states it. Returns the camera and the file's depth_scale
+    /// (millimetres per unit of the depth image, or None).
+    ///
+    /// Raises OSError when the file cannot be read. Raises ValueError, with file and field, when the file is invalid, states
+    /// another size, has an unknown key or a fisheye lens, or cannot be the camera of a whole image of that size (for example with
+    /// a wrong unit or another resolution).
     ///
     /// >>> camera, mm_per_unit = Camera.load("data/demo/camera.json", 640, 480)  # doctest: +SKIP
     #[classmethod]
@@ -125,7 +127,7 @@ impl PyCamera {
             (Some(width), Some(height)) => (whole("width", width, 1)?, whole("height", height, 1)?),
             (None, None) if file.sized => (file.camera.width, file.camera.height),
             _ => {
-                let expected = "the image's width and height, as the file does not say them";
+                let expected = "the image's width and height, as the file does not state them";
                 return Err(bad("width and height", expected, "one or none of them"));
             }
         };
@@ -145,31 +147,31 @@ impl PyCamera {
         self.0.fy
     }
 
-    /// Principal point x, pixels.
+    /// Principal point in x, pixels.
     #[getter]
     fn cx(&self) -> f64 {
         self.0.cx
     }
 
-    /// Principal point y, pixels.
+    /// Principal point in y, pixels.
     #[getter]
     fn cy(&self) -> f64 {
         self.0.cy
     }
 
-    /// Image width in pixels.
+    /// Image width, pixels.
     #[getter]
     fn width(&self) -> usize {
         self.0.width
     }
 
-    /// Image height in pixels.
+    /// Image height, pixels.
     #[getter]
     fn height(&self) -> usize {
         self.0.height
     }
 
-    /// (k1, k2, p1, p2, k3), or None for a pinhole camera.
+    /// Distortion coefficients (k1, k2, p1, p2, k3), or None for a camera without distortion.
     #[getter]
     fn distortion(&self) -> Option<(f64, f64, f64, f64, f64)> {
         self.0.distortion.map(|d| (d.k1, d.k2, d.p1, d.p2, d.k3))
@@ -181,7 +183,7 @@ impl PyCamera {
         arrays::from_matrix3(py, &self.0.matrix())
     }
 
-    /// Projects points (N, 3) in the camera frame, metres, to pinhole pixels (N, 2); NaN at or behind the camera.
+    /// Projects points (N, 3) in the camera frame, metres, to pinhole pixels (N, 2); NaN for points at or behind the camera.
     ///
     /// >>> Camera(500, 500, 320, 240, 640, 480).project([[0.1, 0.0, 1.0]])
     /// array([[370., 240.]])
@@ -194,7 +196,7 @@ impl PyCamera {
         arrays::from_points2(py, points.iter().map(|p| self.0.project(p)))
     }
 
-    /// The points (N, 3) in the camera frame, metres, seen at pinhole pixels (N, 2) at depths (N,) in metres.
+    /// Computes the points (N, 3) in the camera frame, metres, from pinhole pixels (N, 2) and their depths (N,), metres.
     ///
     /// >>> Camera(500, 500, 320, 240, 640, 480).unproject([[370, 240]], [1.0])
     /// array([[0.1, 0. , 1. ]])
@@ -208,7 +210,7 @@ impl PyCamera {
         if pixels.len() != depth.len() {
             return Err(bad(
                 "depth",
-                format!("{} numbers, one a pixel", pixels.len()),
+                format!("{} numbers, one per pixel", pixels.len()),
                 depth.len().to_string(),
             ));
         }
@@ -216,7 +218,7 @@ impl PyCamera {
         arrays::from_points3(py, &points)
     }
 
-    /// Where the raw, distorted image shows what a pinhole would show at pixels (N, 2).
+    /// Converts pinhole pixels (N, 2) to pixels (N, 2) of the raw, distorted image.
     fn distort_points<'py>(
         &self,
         py: Python<'py>,
@@ -226,7 +228,7 @@ impl PyCamera {
         arrays::from_points2(py, pixels.iter().map(|p| Some(self.0.distort_point(p))))
     }
 
-    /// The pinhole pixels for pixels (N, 2) of the raw image; NaN where the distortion cannot be undone.
+    /// Converts pixels (N, 2) of the raw, distorted image to pinhole pixels (N, 2); NaN where the distortion has no inverse.
     fn undistort_points<'py>(
         &self,
         py: Python<'py>,
@@ -236,12 +238,12 @@ impl PyCamera {
         arrays::from_points2(py, pixels.iter().map(|p: &Vec2| self.0.undistort_point(p)))
     }
 
-    /// The same camera without its distortion: what an undistorted image was taken with.
+    /// The same camera without distortion: the camera of an undistorted image.
     fn without_distortion(&self) -> PyCamera {
         PyCamera(self.0.without_distortion())
     }
 
-    /// The camera of a crop, box = (x, y, width, height) in pixels.
+    /// The camera of a crop of the image; box: (x, y, width, height) in pixels.
     ///
     /// >>> Camera(500, 500, 320, 240, 640, 480).crop((100, 50, 200, 200)).cx
     /// 220.0
@@ -282,8 +284,8 @@ impl PyCamera {
     }
 }
 
-/// The colour image (H, W, 3) uint8 that a pinhole camera with the same intrinsics would have taken: bilinear, black
-/// where the raw image shows nothing.
+/// Removes lens distortion from a colour image (H, W, 3) uint8. The result is the image of a pinhole camera with the same
+/// intrinsics: interpolated bilinearly, black outside the raw image.
 ///
 /// Raises ValueError when the image is not of the camera's size.
 ///
@@ -302,8 +304,8 @@ pub(crate) fn undistort_rgb<'py>(
     arrays::from_image_of(py, out)
 }
 
-/// The depth image (H, W) float32 in metres that a pinhole camera with the same intrinsics would have measured: the
-/// nearest raw pixel, 0 where there is none.
+/// Removes lens distortion from a depth image (H, W) float32 in metres. The result is the image of a pinhole camera with the same
+/// intrinsics: values of the nearest raw pixel, 0 outside the raw image.
 ///
 /// Raises ValueError when the image is not of the camera's size.
 ///
@@ -322,8 +324,8 @@ pub(crate) fn undistort_depth<'py>(
     arrays::from_image(py, out)
 }
 
-/// Six numbers (v, w) to a pose (4, 4): the exponential map of SE(3), v in metres, w a rotation vector in radians
-/// (Barfoot 2017, section 7.1).
+/// Computes a pose (4, 4) from six numbers (v, w) by the exponential map of SE(3) (Barfoot 2017, section 7.1). v is in metres; w
+/// is a rotation vector in radians.
 ///
 /// >>> pose_exp([0.1, 0, 1, 0, 0, 0])[:3, 3]
 /// array([0.1, 0. , 1. ])
@@ -338,7 +340,7 @@ pub(crate) fn pose_exp<'py>(
     arrays::from_pose(py, &sixfold::geometry::Pose::exp(&v.into()))
 }
 
-/// A pose (4, 4) to the six numbers (v, w) of pose_exp; for rotation angles below pi.
+/// Computes the six numbers (v, w) of pose_exp from a pose (4, 4), for rotation angles below pi.
 ///
 /// >>> pose_log(pose_exp([0.1, 0, 1, 0, 0, 0.5])).round(9) + 0
 /// array([0.1, 0. , 1. , 0. , 0. , 0.5])

@@ -1,4 +1,4 @@
-//! `sixfold.coco`: detections and their scores, in COCO's JSON.
+//! `sixfold.coco`: detections and their scores, in COCO's JSON format.
 
 use std::path::{Path, PathBuf};
 
@@ -13,7 +13,7 @@ use crate::arrays::{bad, id, pairs};
 use crate::bop::{PyDataset, decode_mask, encode_mask, json_to_python};
 use crate::guard::{dataset_error, free, interruptible, os_error};
 
-/// A file, or what such a file holds, as text.
+/// The text of a JSON file, or of an object with the contents of one; and the path for messages.
 fn document(argument: &'static str, source: &Bound<'_, PyAny>) -> PyResult<(Vec<u8>, PathBuf)> {
     if let Ok(path) = source.extract::<PathBuf>() {
         let bytes = std::fs::read(&path).map_err(|error| {
@@ -37,16 +37,18 @@ fn detections_of(argument: &'static str, source: &Bound<'_, PyAny>) -> PyResult<
     Ok(parse_detections(&text, &path, &ReadDetections::default()).map_err(dataset_error)?.detections)
 }
 
-/// COCO's average precision and recall of boxes or masks, number for number those of pycocotools 2.0.11 (Lin et al. 2014):
-/// a dict with ap, ap50, ap75, ap_small, ap_medium, ap_large, ar1, ar10, ar100, ar_small, ar_medium, ar_large, each 0 to 1
-/// or None where there is no ground truth of that size (pycocotools gives -1).
+/// Computes COCO's average precision and recall of boxes or masks (Lin et al. 2014), with the same numbers as pycocotools 2.0.11.
 ///
-/// ground_truth: a COCO JSON file (BOP: scene_gt_coco.json) or a dict of that form, or {scene_id: file or dict} for several
-/// scenes, or a bop.Dataset, whose poses say what is visible where; images: those of a dataset that count,
-/// [(scene_id, im_id), ...], all if None; detections: a JSON file or a list of dicts with image_id, category_id, score, bbox [x, y, w, h] (pixels) and/or
-/// segmentation (run lengths), BOP's with scene_id; iou_type: "bbox" or "segm". Ctrl-C is heard.
+/// ground_truth: a COCO JSON file (BOP: scene_gt_coco.json) or a dict of that form; {scene_id: file or dict} for several scenes;
+/// or a bop.Dataset, whose ground-truth poses give boxes and masks of the visible parts. detections: a JSON file or a list of dicts
+/// with image_id, category_id, score, bbox [x, y, w, h] (pixels) and/or segmentation (run lengths), in BOP also scene_id.
+/// iou_type: "bbox" or "segm". images: the images of a bop.Dataset to evaluate, [(scene_id, im_id), ...]; all if None. Ctrl-C
+/// interrupts it.
 ///
-/// Raises OSError for files that cannot be read, ValueError with entry and field for broken ones.
+/// Returns a dict with ap, ap50, ap75, ap_small, ap_medium, ap_large, ar1, ar10, ar100, ar_small, ar_medium and ar_large. Each is
+/// from 0 to 1, or None if there is no ground truth of that size (-1 in pycocotools).
+///
+/// Raises OSError for files that cannot be read; ValueError with entry and field for invalid ones.
 ///
 /// >>> truth = {"images": [{"id": 1}],
 /// ...          "annotations": [{"id": 1, "image_id": 1, "category_id": 5, "bbox": [10, 10, 50, 50]}]}
@@ -74,7 +76,7 @@ fn evaluate<'py>(
         return json_to_python(py, &scores);
     }
     if images.is_some() {
-        return Err(bad("images", "None, as ground_truth is no Dataset", "some"));
+        return Err(bad("images", "None, as ground_truth is not a Dataset", "some"));
     }
     let mut truth = CocoGroundTruth::default();
     let mut add = |scene_id: u32, source: &Bound<'py, PyAny>| -> PyResult<()> {
@@ -97,7 +99,7 @@ fn evaluate<'py>(
     json_to_python(py, &scores)
 }
 
-/// The ground truth of a dataset's images by its poses.
+/// The ground truth of a dataset's images, computed from its poses.
 fn truth_of(
     py: Python<'_>,
     dataset: &PyDataset,
@@ -112,11 +114,15 @@ fn truth_of(
     Ok(truth.map_err(dataset_error)?.truth)
 }
 
-/// Reads detections in COCO's JSON (BOP's form with scene_id): a list of dicts with scene_id, image_id, category_id, score,
-/// bbox, segmentation, time; those with an empty box are left out. With image_size (width, height) boxes are clipped.
-/// lenient=True leaves broken entries out. A warning tells what was changed.
+/// Reads a file of detections in COCO's JSON format, or in BOP's form of it with scene_id.
 ///
-/// Raises OSError when the file cannot be read, ValueError with entry and field when it is broken.
+/// image_size: (width, height) of the images, pixels; if given, boxes are clipped to it, and detections with boxes outside are left
+/// out. Detections with an empty box are always left out. lenient=True also leaves invalid entries out. A warning reports what was
+/// changed or left out.
+///
+/// Returns a list of dicts with scene_id, image_id, category_id, score, bbox, segmentation and time.
+///
+/// Raises OSError when the file cannot be read; ValueError with entry and field when it is invalid.
 ///
 /// >>> found = read_detections("detections.json", image_size=(640, 480))  # doctest: +SKIP
 #[pyfunction]
@@ -155,9 +161,11 @@ fn as_json(d: &Detection) -> serde_json::Value {
     })
 }
 
-/// Writes detections, a list of dicts as read_detections gives, in BOP's form; all or nothing.
+/// Writes detections in BOP's form of COCO's JSON format, completely or not at all.
 ///
-/// Raises OSError when the file cannot be written, ValueError with entry and field for a broken one.
+/// detections: a list of dicts, as returned by read_detections.
+///
+/// Raises OSError when the file cannot be written; ValueError with entry and field for an invalid detection.
 ///
 /// >>> write_detections("out/detections.json", found)  # doctest: +SKIP
 #[pyfunction]
@@ -169,7 +177,7 @@ fn write_detections(py: Python<'_>, path: PathBuf, detections: &Bound<'_, PyAny>
     free(py, || sixfold::bop::write_detections(Path::new(&path), &list))?.map_err(dataset_error)
 }
 
-/// Adds what is in `sixfold.coco`.
+/// Adds the contents of `sixfold.coco`.
 pub(crate) fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(evaluate, module)?)?;
     module.add_function(wrap_pyfunction!(read_detections, module)?)?;

@@ -1,4 +1,4 @@
-//! `Estimator.run_dataset`: a method on all targets of a BOP dataset (`sixfold-runner`), between its thread and Python.
+//! `Estimator.run_dataset`: runs a method on all targets of a BOP dataset (`sixfold-runner`) and reports its events to Python.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -19,13 +19,13 @@ use crate::bop::json_to_python;
 use crate::guard::{Leave, Stop, Tell, dataset_error, os_error, reporting, results_error};
 use crate::training::file_or_value;
 
-/// A method, a dataset, and where the results go.
+/// A method, a dataset, and the result file.
 pub(crate) struct Run {
     pub method: Arc<dyn PoseEstimator>,
     pub path: PathBuf,
     pub out: PathBuf,
     pub split: String,
-    /// "gt", or a file of COCO detections.
+    /// "gt" for ground-truth boxes, or a file of COCO detections.
     pub boxes: Option<PathBuf>,
     pub detector: Option<PathBuf>,
     pub targets: Option<PathBuf>,
@@ -35,14 +35,14 @@ pub(crate) struct Run {
     pub record: RunOptions,
 }
 
-/// What a run reports, as it crosses from its thread.
+/// An event that a run sends from its thread.
 enum Event {
     Image { image: String, done: usize, total: usize },
     Note(String),
 }
 
 impl Event {
-    /// Notes as Python's warnings; images for the user's callback.
+    /// Passes notes on as Python warnings, and images to the user's callback.
     fn report(self, py: Python<'_>, progress: Option<&Py<PyAny>>) -> PyResult<()> {
         match (self, progress) {
             (Event::Note(text), _) => py.import("warnings")?.call_method1("warn", (text,)).map(drop),
@@ -59,8 +59,8 @@ impl Event {
     }
 }
 
-/// Runs, and calls the callback. Ctrl-C, or an error of the callback, ends the run after the current image, whose rows are on the
-/// disk.
+/// Runs a method on a dataset and calls the callback after every image. Ctrl-C or an error of the callback ends the run after the
+/// current image, when its rows are on disk.
 pub(crate) fn run<'py>(
     py: Python<'py>,
     run: Run,
@@ -70,7 +70,7 @@ pub(crate) fn run<'py>(
         return Err(bad("out", "a file that ends in .csv", run.out.display().to_string()));
     }
     if let (Some(boxes), Some(_)) = (&run.boxes, &run.detector) {
-        return Err(bad("boxes", "None beside a detector", boxes.display().to_string()));
+        return Err(bad("boxes", "None with a detector", boxes.display().to_string()));
     }
     let summary = reporting(
         py,
@@ -82,7 +82,7 @@ pub(crate) fn run<'py>(
 }
 
 impl Run {
-    // The callback's error is the runner's.
+    // The callback has to return the runner's error type, which is large.
     #[allow(clippy::result_large_err)]
     fn run(&self, stop: &Stop, tell: &Tell<Event>) -> PyResult<DatasetSummary> {
         let dataset = BopDataset::open(&self.path, &self.split).map_err(dataset_error)?;
@@ -119,7 +119,7 @@ impl Run {
         Ok(summary)
     }
 
-    /// Where the targets are, and what was left out of a file of detections.
+    /// The regions to search, and which detections of a file were left out.
     fn regions(
         &self,
         dataset: &BopDataset,
@@ -147,7 +147,7 @@ impl Run {
         self.cache.as_ref().map_or_else(Cache::none, |folder| Cache::new(folder, Cache::LIMIT))
     }
 
-    /// The options that decide about the results.
+    /// The options that affect the results.
     fn options(&self) -> RunOptions {
         let mut options = self.record.clone();
         options.add("split", &self.split);
@@ -169,7 +169,7 @@ impl Run {
     }
 }
 
-/// A run that cannot continue.
+/// The Python exception for a run that cannot continue.
 fn run_error(error: RunError) -> PyErr {
     let text = describe(&error);
     match error {

@@ -1,4 +1,4 @@
-//! `Detector`: boxes and masks of known objects in an image.
+//! `Detector`: finds boxes and masks of known objects in an image.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -24,16 +24,16 @@ fn model_error(error: ModelError) -> PyErr {
 /// An object that a detector found.
 #[pyclass(name = "DetectedObject", module = "sixfold", frozen)]
 pub(crate) struct DetectedObject {
-    /// The object.
+    /// The object's id.
     #[pyo3(get)]
     object_id: u32,
-    /// Confidence, 0 to 1: the expected overlap of the box with the object's.
+    /// Confidence, 0 to 1: the expected overlap of this box with the object's true box.
     #[pyo3(get)]
     score: f32,
     /// Box of the visible part, (4,) float64: x, y, width, height in pixels.
     #[pyo3(get)]
     bbox: Py<PyArray1<f64>>,
-    /// Visible part, (H, W) bool, or None without masks.
+    /// Mask of the visible part, (H, W) bool; None without masks.
     #[pyo3(get)]
     mask: Option<Py<PyArray2<bool>>>,
 }
@@ -45,7 +45,7 @@ impl DetectedObject {
     }
 }
 
-/// A trained detector: where known objects are, from colour alone. Made by `load`; its boxes are what `Pix2Pose` asks for.
+/// A trained detector that finds known objects in colour images. `load` reads one; `Pix2Pose` takes its boxes.
 ///
 /// >>> detector = Detector.load("weights/detector-lmo.safetensors")  # doctest: +SKIP
 /// >>> found = detector(rgb)  # doctest: +SKIP
@@ -57,41 +57,41 @@ pub(crate) struct Detector {
 
 #[pymethods]
 impl Detector {
-    /// Reads a weight file (.safetensors) that `train_detector` or `sixfold train detector` wrote.
+    /// Reads a weight file (.safetensors) written by `train_detector` or `sixfold train detector`.
     ///
-    /// Raises OSError when the file cannot be read, ValueError when it is no such model.
+    /// Raises OSError when the file cannot be read; ValueError when it is not such a model.
     #[classmethod]
     fn load(_class: &Bound<'_, PyType>, py: Python<'_>, path: PathBuf) -> PyResult<Self> {
         let model = interruptible(py, move |_| DetectorModel::load(&path))?.map_err(model_error)?;
         Ok(Detector { model: Arc::new(model) })
     }
 
-    /// Ids of the objects that it knows.
+    /// Ids of the objects that the detector was trained on.
     #[getter]
     fn object_ids(&self) -> Vec<u32> {
         self.model.classes().iter().map(|class| class.id).collect()
     }
 
-    /// Detections with a lower score are left out unless a call says otherwise.
+    /// The default threshold: detections with a lower score are left out.
     #[getter]
     fn threshold(&self) -> f32 {
         self.model.usage().threshold
     }
 
-    /// The model's card: what it was trained on, how, with which scores.
+    /// The model's card, a dict: its training data, training and scores.
     #[getter]
     fn card<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         crate::bop::json_to_python(py, self.model.card())
     }
 
-    /// Looks for the detector's objects in an image: a list of DetectedObject, best first.
+    /// Searches for the detector's objects in an image: a list of DetectedObject, best first.
     ///
-    /// rgb (H, W, 3) uint8, of any size, larger ones are reduced; object_ids: only these; threshold on the score in place of
-    /// the model's; overlap: of two boxes of an object that overlap more (intersection over union) the worse one is left
-    /// out; at most per_object detections of an object and max_detections in all; masks=False leaves the masks out. Ctrl-C
-    /// is heard.
+    /// rgb: (H, W, 3) uint8, of any size; large images are downscaled for the network. object_ids: return only these objects.
+    /// threshold: minimum score, 0 to 1, instead of the model's. overlap: if two boxes of an object have a larger intersection over
+    /// union, 0 to 1, the one with the lower score is left out. per_object, max_detections: maximum number of detections of each
+    /// object and of all objects (before object_ids is applied). masks=False: compute no masks. Ctrl-C interrupts it.
     ///
-    /// Raises ValueError for an unknown object, an option out of its range, an image without pixels.
+    /// Raises ValueError for an unknown object, an option out of range or an image without pixels.
     #[pyo3(signature = (rgb, *, object_ids=None, threshold=None, overlap=0.5, per_object=100, max_detections=100, masks=true))]
     #[allow(clippy::too_many_arguments)]
     fn __call__(
@@ -145,7 +145,7 @@ impl Detector {
     }
 }
 
-/// 0 to 1.
+/// A number from 0 to 1.
 fn fraction(argument: &str, value: f64) -> PyResult<f32> {
     if (0.0..=1.0).contains(&value) {
         Ok(value as f32)

@@ -1,4 +1,4 @@
-//! `DgcmNet`: the network that compares what is seen with what was seen (`sixfold-dgcm`).
+//! `DgcmNet`: the network that compares the current view of an object with earlier ones (`sixfold-dgcm`).
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -26,8 +26,8 @@ fn model_error(error: ModelError) -> PyErr {
     }
 }
 
-/// The network that grasps from experience need: it turns what is seen of an object into 256 numbers that are alike for
-/// objects of like shape, and finds the places of one object on another (dissertation, chapter 6). Made by `load`.
+/// The network for grasping from experience (dissertation, chapter 6). It computes a feature of 256 numbers from the view of an
+/// object, similar for objects of similar shape, and finds corresponding points of two objects. `load` reads one.
 ///
 /// >>> network = DgcmNet.load("weights/dgcm.safetensors")  # doctest: +SKIP
 /// >>> network.feature(depth, camera, mask).shape  # doctest: +SKIP
@@ -37,31 +37,31 @@ pub(crate) struct DgcmNet(Arc<DgcmModel>);
 
 #[pymethods]
 impl DgcmNet {
-    /// Reads a weight file (.safetensors) that `train_dgcm` or `sixfold train dgcm` wrote.
+    /// Reads a weight file (.safetensors) written by `train_dgcm` or `sixfold train dgcm`.
     ///
-    /// Raises OSError when the file cannot be read, ValueError when it is no such model.
+    /// Raises OSError when the file cannot be read; ValueError when it is not such a model.
     #[classmethod]
     fn load(_class: &Bound<'_, PyType>, py: Python<'_>, path: PathBuf) -> PyResult<Self> {
         read_network(py, path).map(DgcmNet)
     }
 
-    /// The model's card: what it was trained on, how, with which scores.
+    /// The model's card, a dict: its training data, training and scores.
     #[getter]
     fn card<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         json_to_python(py, self.0.card())
     }
 
-    /// A name that tells its features from those of another network; features of different networks cannot be compared.
+    /// A name that identifies the network of a feature. Features of different networks cannot be compared.
     #[getter]
     fn fingerprint(&self) -> String {
         self.0.fingerprint()
     }
 
-    /// What the network makes of an object: (256,) float32.
+    /// Computes the feature of an object: (256,) float32.
     ///
-    /// depth (H, W) in metres, without lens distortion; mask (H, W) bool of the object. Ctrl-C is heard.
+    /// depth: (H, W), metres, without lens distortion. mask: (H, W) bool, the object's pixels. Ctrl-C interrupts it.
     ///
-    /// Raises ValueError for a mask without depth or of several objects, images of another size than the camera's.
+    /// Raises ValueError for a mask without depth or of several objects, and for images of another size than the camera's.
     #[pyo3(signature = (depth, camera, mask, *, seed=0))]
     fn feature<'py>(
         &self,
@@ -86,7 +86,7 @@ fn read_network(py: Python<'_>, path: PathBuf) -> PyResult<Arc<DgcmModel>> {
     Ok(Arc::new(interruptible(py, move |_| DgcmModel::load(&path))?.map_err(model_error)?))
 }
 
-/// A DgcmNet, or the network of a weight file.
+/// The network of a DgcmNet or of a weight file.
 pub(crate) fn network_of(py: Python<'_>, weights: &Bound<'_, PyAny>) -> PyResult<Arc<DgcmModel>> {
     if let Ok(network) = weights.cast::<DgcmNet>() {
         return Ok(network.get().0.clone());
@@ -97,7 +97,7 @@ pub(crate) fn network_of(py: Python<'_>, weights: &Bound<'_, PyAny>) -> PyResult
     read_network(py, path)
 }
 
-/// An object in a depth image, as it was handed in.
+/// An object in a depth image, as given by the caller.
 pub(crate) struct DepthInput {
     depth: DepthImage,
     camera: Camera,

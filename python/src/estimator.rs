@@ -1,4 +1,4 @@
-//! `Estimator`: any method of `sixfold estimate` on one image or on a dataset, by the trait that the program uses too
+//! `Estimator`: any method of `sixfold estimate` on one image or on a dataset, through the same trait as the program
 //! (`sixfold-estimator`).
 
 use std::path::PathBuf;
@@ -26,27 +26,27 @@ use crate::mesh::PyMesh;
 use crate::methods::{Options, make};
 use crate::ppf::{depth_error, verification_to_python};
 
-/// A pose that an Estimator found.
+/// A pose found by an Estimator.
 #[pyclass(name = "Estimate", module = "sixfold", frozen)]
 pub(crate) struct PyPoseEstimate {
     /// The pose, (4, 4) float64, metres.
     #[pyo3(get)]
     camera_from_object: Py<PyArray2<f64>>,
-    /// What decides between estimates of one method, 0 to 1.
+    /// Confidence, 0 to 1; comparable only between estimates of one method.
     #[pyo3(get)]
     confidence: f64,
-    /// The probability that the pose is right (no point of the object further than a tenth of the diameter from where it is), where
-    /// the method knows it (auto); None otherwise.
+    /// The probability that the pose is right, if the method computes it (auto); None otherwise. A pose is right if no point of the
+    /// object is further than a tenth of the diameter from its true position.
     #[pyo3(get)]
     probability: Option<f64>,
-    /// The object's visible pixels, (H, W) bool, where the method segments; None otherwise.
+    /// Mask of the object's visible pixels, (H, W) bool, if the method segments; None otherwise.
     #[pyo3(get)]
     mask: Option<Py<PyArray2<bool>>>,
-    /// Other results of the method, under its own keys as `sixfold estimate --json` prints them; with `verification`, a dict as
-    /// that of PpfEstimate, where there is depth.
+    /// Other results of the method, under the same keys as in `sixfold estimate --json`. If the pose was verified with depth, also
+    /// `verification`, a dict as in PpfEstimate.
     #[pyo3(get)]
     details: Py<PyDict>,
-    /// Remarks on this pose, a sentence each; usually empty.
+    /// Notes on this pose, one sentence each; usually empty.
     #[pyo3(get)]
     notes: Vec<String>,
 }
@@ -74,17 +74,17 @@ fn to_python(py: Python<'_>, estimate: PoseEstimate, camera: &Camera) -> PyResul
     })
 }
 
-/// An object that was searched before: the next search of an equal one needs no preparation.
+/// An object that was searched before. The next search for an equal one needs no preparation.
 struct Known {
     id: Option<u32>,
     shape: Option<(Arc<Mesh>, ModelInfo)>,
     prepared: Arc<dyn PreparedObject>,
 }
 
-/// So many objects are kept, those of the latest searches.
+/// Maximum number of objects kept, those of the latest searches.
 const KEPT: usize = 32;
 
-/// The objects of the latest searches, the last one last.
+/// The objects of the latest searches, the most recent one last.
 #[derive(Default)]
 struct Searched(Mutex<Vec<Known>>);
 
@@ -118,20 +118,29 @@ impl Searched {
     }
 }
 
-/// A method of `sixfold estimate`, the same interface for all of them: `find` searches one image, `run_dataset` all targets of a
-/// BOP dataset.
+/// A method of `sixfold estimate`. The interface is the same for all methods: `find` searches one image, `run_dataset` all targets
+/// of a BOP dataset.
 ///
-/// method: "ppf", point pair features on depth, no training; "mttm", templates in depth, no training; "pix2pose", object
-/// coordinates from colour by a trained network, in boxes; "views", rendered views of the mesh matched with the colours, in boxes,
-/// no training; "auto", the default, all methods that the images allow, one after the other until one is sure, each pose with its probability. weights: pix2pose's network (needed), or another one for mttm and views than that of the package; for auto those of pix2pose, which is else left out.
-/// budget (auto): seconds for an object after which no further method is asked; poses then depend on how fast the machine is. keep_plane (ppf, mttm, auto): search points on the table plane too. matcher (mttm): "points", "network" or
-/// "both". templates_only (mttm): judge poses by the templates alone, as if there were no mesh. templates (mttm): "above", what
-/// stands on a table, z axis up, or "around", anything in any orientation, slower (above unless given). refine (pix2pose, views): align the
-/// rendered outline with the image where there is a mesh; passes (pix2pose): max number of passes over an object (1 unless given); icp (pix2pose): align
-/// poses with the depth image. seed of everything random.
+/// method, the default is "auto":
 ///
-/// Raises ValueError for another method, an option other than its default that is not one of the method's, a file that is no
-/// such network; OSError when it cannot be read. Ctrl-C is heard.
+/// - "ppf": point pair features in depth, without training.
+/// - "mttm": templates in depth, without training.
+/// - "pix2pose": object coordinates predicted from colour by a network trained on the objects, in given boxes.
+/// - "views": rendered views of the mesh matched with colour, without training; in given boxes, or in the proposals of a built-in
+///   detector.
+/// - "auto": all methods that the images allow, one after the other, until one is certain. Each pose has a probability.
+///
+/// weights: the network of pix2pose (required); for mttm and views a network instead of the built-in one; for auto the network of
+/// pix2pose, without which pix2pose is left out. budget (auto): seconds per object after which no further method starts; poses then
+/// depend on the speed of the machine. keep_plane (ppf, mttm, auto): also search points on the table plane. matcher (mttm):
+/// "points", "network" or "both". templates_only (mttm): verify poses with the templates only, as if there were no mesh. templates
+/// (mttm): "above" (default), for objects that stand on a table with their z axis up, or "around", for objects in any orientation
+/// (slower). refine (pix2pose, views): align the rendered outline with the image. For pix2pose this needs a mesh, and a network
+/// then refines the pose too, unless icp is set. passes (pix2pose): maximum number of passes over an object, 1 by default.
+/// icp (pix2pose): align poses with the depth image. seed: the seed of all random numbers.
+///
+/// Raises ValueError for an unknown method, a changed option that the method does not have, or a file that is not such a network;
+/// OSError when the file cannot be read. Ctrl-C interrupts it.
 ///
 /// >>> estimator = Estimator("ppf")
 /// >>> estimator.needs["depth"], estimator.needs["rgb"]
@@ -141,7 +150,7 @@ impl Searched {
 #[pyclass(name = "Estimator", module = "sixfold", frozen)]
 pub(crate) struct PyEstimator {
     method: Arc<dyn PoseEstimator>,
-    /// Ids of the objects that the weights know; empty where any mesh can be searched.
+    /// Ids of the objects that the weights were trained on; empty if any mesh can be searched.
     ids: Vec<u32>,
     record: RunOptions,
     searched: Arc<Searched>,
@@ -189,8 +198,7 @@ impl PyEstimator {
         self.method.name()
     }
 
-    /// What the method needs, a dict: of depth, rgb, region (box or mask) and object whether it is "required", "optional" or
-    /// "unused".
+    /// The method's inputs, a dict: "required", "optional" or "unused" for each of depth, rgb, region (box or mask) and object.
     #[getter]
     fn needs<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let needs = self.method.needs();
@@ -208,19 +216,21 @@ impl PyEstimator {
         Ok(dict)
     }
 
-    /// Looks for an object in an image: a list of Estimate, best first, empty where it is not found.
+    /// Searches for an object in an image: a list of Estimate, best first; empty if it is not found.
     ///
-    /// object: a Mesh, or None where the method's weights know the object (pix2pose without icp; its outline is not aligned
-    /// then); id: which of the weights' objects it is, not needed where they know one. depth (H, W) metres; rgb (H, W, 3) uint8;
-    /// images are without lens distortion, and what the method does not use is ignored (`needs`). box (4,) x, y, width,
-    /// height in pixels, mask (H, W) bool: where the object is, with both in what they share. instances: max number of poses;
-    /// min_confidence: poses of a lower one are left out (unless given 0.25 for ppf, 0.45 for mttm, 0.4 for views, 0 for pix2pose, 0.5 for auto). What is
-    /// derived from an object is kept for the next call. The same input gives the same result at any number of threads. Ctrl-C
-    /// is heard.
+    /// object: a Mesh; None is possible if the weights were trained on the object (pix2pose without icp; its outline is then not
+    /// aligned). id: the object's id in the weights; not needed if they have only one object. depth: (H, W), metres. rgb: (H, W, 3)
+    /// uint8. Images are without lens distortion; images that the method does not use are ignored (`needs`). auto needs depth or
+    /// rgb. box: (4,) x, y, width, height in pixels. mask: (H, W) bool. box and mask contain the object; with both, their
+    /// intersection does. instances: maximum number of poses. min_confidence: poses with a lower confidence are left out; by
+    /// default 0.25 for ppf, 0.45 for mttm, 0.4 for views, 0 for pix2pose, 0.5 for auto.
     ///
-    /// Raises ValueError for what the method needs and is not given, a mesh without faces or of another object than the
-    /// weights', images of different sizes, a box without area or outside the image, an empty mask, a depth in the wrong unit
-    /// or without any value.
+    /// Data computed from an object are kept for the next call. The same input gives the same result with any number of threads.
+    /// Ctrl-C interrupts it.
+    ///
+    /// Raises ValueError for a missing input that the method needs, a mesh without faces or of another object than the weights',
+    /// images of different sizes, a box without area or outside the image, an empty mask, and a depth image in the wrong unit or
+    /// without any value.
     #[pyo3(signature = (object, camera, depth=None, rgb=None, r#box=None, mask=None, instances=1, min_confidence=None, *, id=None))]
     #[allow(clippy::too_many_arguments)]
     fn find(
@@ -283,22 +293,23 @@ impl PyEstimator {
         found.into_iter().map(|estimate| to_python(py, estimate, &camera)).collect()
     }
 
-    /// Looks for all targets of a BOP dataset and writes the poses to a result file as the BOP Challenge has it, image by image:
-    /// what `sixfold estimate --dataset` does. An existing file is resumed if the same call made it; `out`.run.json beside it
-    /// holds the options.
+    /// Searches for all targets of a BOP dataset, as `sixfold estimate --dataset` does. Poses are written image by image to a
+    /// result file of the BOP Challenge. If the file exists and the same call started it, the run resumes; the file `out`.run.json
+    /// next to it records the options.
     ///
-    /// path: the dataset's folder; out: the result file (.csv). boxes: "gt" for the boxes of the ground truth, or a file of
-    /// COCO detections; detector: a weight file that `train_detector` wrote, whose boxes are taken; without both the whole
-    /// image is searched. targets: a targets file (default test_targets_bop19.json, or all ground truth). min_confidence:
-    /// poses of a lower one are left out (unless given 0.05 for ppf and mttm, 0 for pix2pose and views). cache: a folder for what is
-    /// derived from the models, to be faster the next time. progress: called after every image with a dict of stage, done,
-    /// total, image.
+    /// path: the dataset's folder. out: the result file (.csv). boxes: "gt" for ground-truth boxes, or a file of COCO detections.
+    /// detector: a weight file written by `train_detector`, to use its boxes; without boxes and detector the whole image is
+    /// searched. targets: a targets file; by default test_targets_bop19.json, or without this file all ground-truth poses that are
+    /// at least 10 % visible. min_confidence: poses with a lower confidence are left out; by default 0.05 for ppf and mttm, 0 for
+    /// pix2pose, views and auto. cache: a folder for data computed from the models, which makes later runs faster. progress: called
+    /// after every image with a dict of stage, done, total and image.
     ///
-    /// Returns a dict with images, targets, poses (rows of the file), skipped (what was left out, and why), seconds_per_image
-    /// (of those done now, or None), results. Ctrl-C ends the run after the current image; call it again to resume.
+    /// Returns a dict with images, targets, poses (rows of the file), skipped (images and targets left out, with reasons),
+    /// seconds_per_image (mean over the images of this run, or None) and results (the result file). Ctrl-C ends the run after the
+    /// current image; the same call resumes it.
     ///
-    /// Raises OSError for files that cannot be read or written; ValueError for broken ones, a method that needs boxes without
-    /// any, a result file that was made with other options.
+    /// Raises OSError for files that cannot be read or written; ValueError for invalid files, a method that needs boxes but has
+    /// none, and a result file that was made with other options.
     #[pyo3(signature = (path, out, split="test", boxes=None, detector=None, targets=None, min_confidence=None, *, cache=None, progress=None))]
     #[allow(clippy::too_many_arguments)]
     fn run_dataset<'py>(
@@ -335,7 +346,7 @@ impl PyEstimator {
 }
 
 impl PyEstimator {
-    /// The object that is meant, checked where weights know which there are.
+    /// The object's id, checked against the objects of the weights, if these have any.
     fn id_of(&self, given: Option<i64>) -> PyResult<Option<u32>> {
         let id = given.map(|id| arrays::id("id", id)).transpose()?;
         let known = || self.ids.iter().map(u32::to_string).collect::<Vec<_>>().join(" or ");
@@ -349,14 +360,14 @@ impl PyEstimator {
     }
 }
 
-/// A mesh with what is known of its object.
+/// A mesh with the properties of its object.
 fn shape_of(py: Python<'_>, object: &Bound<'_, PyAny>) -> PyResult<(Arc<Mesh>, ModelInfo)> {
     let found = || bad("object", "a Mesh", object.get_type().to_string());
     let mesh = object.cast::<PyMesh>().map_err(|_| found())?.get();
     Ok((mesh.mesh.clone(), free(py, || mesh.info())?))
 }
 
-/// A threshold on the confidence.
+/// A confidence threshold from 0 to 1.
 fn confidence(value: Option<f64>) -> PyResult<Option<f64>> {
     match value {
         Some(v) if !(0.0..=1.0).contains(&v) => {
@@ -366,7 +377,7 @@ fn confidence(value: Option<f64>) -> PyResult<Option<f64>> {
     }
 }
 
-/// Where to look: in a box, in a mask, or in what they share.
+/// The region to search: a box, a mask, or their intersection.
 fn region_of(
     camera: &Camera,
     bbox: Option<&Bound<'_, PyAny>>,
@@ -384,7 +395,7 @@ fn region_of(
     Ok(Some(Region::of_mask(mask).ok_or_else(|| bad("mask", expected, "none"))?))
 }
 
-/// A box that has an area and shows something of the image.
+/// A box that has an area and overlaps the image.
 fn box_of(camera: &Camera, given: &Bound<'_, PyAny>) -> PyResult<Rect> {
     let boxes = arrays::boxes("box", given)?;
     let [bbox] = boxes[..] else {
@@ -401,7 +412,7 @@ fn box_of(camera: &Camera, given: &Bound<'_, PyAny>) -> PyResult<Rect> {
     Ok(bbox)
 }
 
-/// A search that cannot be done.
+/// The Python exception for a search that is not possible.
 fn estimator_error(error: EstimatorError) -> PyErr {
     let named = |argument: &str, source: &(dyn std::error::Error + 'static)| {
         PyValueError::new_err(format!("{argument}: {}", describe(source)))

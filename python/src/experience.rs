@@ -1,4 +1,4 @@
-//! `ExperienceStore`: grasps that worked, kept in one file (`sixfold-dgcm`).
+//! `ExperienceStore`: successful grasps, kept in one file (`sixfold-dgcm`).
 
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -23,7 +23,7 @@ use crate::grasp::PyGrasp;
 use crate::gripper::gripper_of;
 use crate::guard::{Stop, image_error, interruptible, os_error};
 
-/// A store that cannot do what was asked.
+/// The Python exception for an error of a store.
 pub(crate) fn store_error(error: StoreError) -> PyErr {
     use std::io::ErrorKind;
     let text = error.to_string();
@@ -38,7 +38,7 @@ pub(crate) fn store_error(error: StoreError) -> PyErr {
     }
 }
 
-/// The file, and all features of one network in memory once something was searched.
+/// The opened file. After the first search, also all features of one network in memory.
 pub(crate) struct Opened {
     path: PathBuf,
     store: SqliteStore,
@@ -46,7 +46,7 @@ pub(crate) struct Opened {
 }
 
 impl Opened {
-    /// The experiences for a network, with what other processes have stored meanwhile.
+    /// The experiences of a network, including those that other processes have stored meanwhile.
     pub(crate) fn memory(&mut self, model: &DgcmModel) -> Result<&mut Memory, StoreError> {
         let name = model.fingerprint();
         let kept = self.memory.take().filter(|(network, _)| *network == name);
@@ -61,13 +61,14 @@ impl Opened {
     }
 }
 
-/// Grasps that worked, with what the camera saw, in one file that several processes may use at once (dissertation, section
-/// 6.2.1). `propose_grasps(..., experiences=store)` transfers them to other objects.
+/// A store of successful grasps, each with the camera's view of its object (dissertation, section 6.2.1).
+/// `propose_grasps(..., experiences=store)` transfers the grasps to other objects. A store is one file, which several processes may
+/// use at the same time.
 ///
-/// path: the file; it is made where there is none, unless create is False. weights: a DgcmNet, or the path of its weight
-/// file, for all that compares experiences; without it the store can be listed, merged and exported.
+/// path: the file; it is created if it does not exist, unless create is False. weights: a DgcmNet, or the path of its weight file;
+/// needed to add and compare experiences. Without it the store can be listed, merged and exported.
 ///
-/// Raises FileNotFoundError or OSError for a file that cannot be opened, ValueError for one that is no store.
+/// Raises FileNotFoundError or OSError for a file that cannot be opened; ValueError for a file that is not a store.
 ///
 /// >>> import tempfile
 /// >>> with tempfile.TemporaryDirectory() as folder:
@@ -82,7 +83,7 @@ pub(crate) struct ExperienceStore {
 }
 
 impl ExperienceStore {
-    /// The network of a call, or else of the store.
+    /// The network given in a call, or otherwise that of the store.
     pub(crate) fn network(
         &self,
         py: Python<'_>,
@@ -100,7 +101,7 @@ impl ExperienceStore {
         self.opened.clone()
     }
 
-    /// Runs work on the opened store, without the interpreter lock.
+    /// Runs work on the opened store without the interpreter lock.
     fn with<T: Send + 'static>(
         &self,
         py: Python<'_>,
@@ -111,7 +112,7 @@ impl ExperienceStore {
     }
 }
 
-/// The store, also after a call that ended in a panic: what it has in memory is read again when it is asked for.
+/// Locks the store, also after a call that ended in a panic. Features in memory are read again when they are needed.
 pub(crate) fn lock(opened: &Mutex<Opened>) -> MutexGuard<'_, Opened> {
     opened.lock().unwrap_or_else(PoisonError::into_inner)
 }
@@ -145,15 +146,15 @@ impl ExperienceStore {
         self.with(py, |opened, _| opened.store.list().map(|all| all.len()))
     }
 
-    /// Stores a grasp that worked: its number, and False where it was stored already. When the call returns, the experience
-    /// is on the disk.
+    /// Stores a successful grasp. Returns the experience's number, and True if it is new or False if it was stored before. When the
+    /// call returns, the experience is on disk.
     ///
-    /// depth (H, W) in metres, without lens distortion; mask (H, W) bool of the object; grasp: a Grasp, or a (4, 4)
-    /// camera_from_gripper in metres together with opening (distance of the pads before closing) and width (distance of the
-    /// contacts), metres; object: what was grasped; part: the part that was grasped, such as "handle"; provenance: where
-    /// the experience comes from, in words. Ctrl-C is heard.
+    /// depth: (H, W), metres, without lens distortion. mask: (H, W) bool, the object's pixels. grasp: a Grasp, or
+    /// camera_from_gripper (4, 4), metres, together with opening (distance of the pads before closing) and width (distance of the
+    /// contacts), both in metres. object: the name of the grasped object. part: the part that was grasped, such as "handle".
+    /// provenance: where the experience comes from, as text. Ctrl-C interrupts it.
     ///
-    /// Raises ValueError for a mask without depth, a gripper that is nowhere near the object, a store without network.
+    /// Raises ValueError for a mask without depth, a gripper that is not near the object, or a store without a network.
     #[pyo3(signature = (depth, camera, mask, grasp, *, object, part=None, gripper=None, opening=None, width=None, provenance="added by hand", weights=None, seed=0))]
     #[allow(clippy::too_many_arguments)]
     fn add(
@@ -191,13 +192,13 @@ impl ExperienceStore {
         self.with(py, move |opened, _| opened.store.add(&made))
     }
 
-    /// All experiences, in the order of their numbers: dicts with id, time (seconds since 1970), object, part, gripper,
-    /// width (metres), network, provenance.
+    /// Lists all experiences in the order of their numbers: dicts with id, time (seconds since 1970), object, part, gripper, width
+    /// (metres), network and provenance.
     fn list<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         json_to_python(py, &self.with(py, |opened, _| opened.store.list())?)
     }
 
-    /// An experience by its number, or None.
+    /// The experience with this number, or None.
     ///
     /// Raises ValueError when it cannot be read.
     fn get(&self, py: Python<'_>, id: i64) -> PyResult<Option<PyExperience>> {
@@ -205,13 +206,14 @@ impl ExperienceStore {
         Ok(stored.map(PyExperience::new))
     }
 
-    /// Forgets an experience; False when there was none of this number. Numbers are never used twice.
+    /// Removes an experience; False if there was none with this number. Numbers are never reused.
     fn forget(&self, py: Python<'_>, id: i64) -> PyResult<bool> {
         self.with(py, move |opened, _| opened.store.forget(id))
     }
 
-    /// Takes over the experiences of another store (its path) that are not here yet; how many were new. Ctrl-C keeps what
-    /// was taken over until then.
+    /// Copies the experiences of another store that are missing here. Returns the number of new experiences.
+    ///
+    /// other: the path of that store. Ctrl-C interrupts it; experiences copied until then are kept.
     ///
     /// Raises OSError or ValueError when the other file cannot be read.
     fn merge(&self, py: Python<'_>, other: PathBuf) -> PyResult<usize> {
@@ -229,18 +231,19 @@ impl ExperienceStore {
         })
     }
 
-    /// Encodes all experiences again with another network, into another store: how many are new there.
+    /// Encodes all experiences with another network and adds them to another store. Returns the number of new experiences there.
     ///
-    /// out: the other file; weights: a DgcmNet or the path of its file. Ctrl-C keeps what was encoded until then.
+    /// out: the path of that store, which is created if it does not exist. weights: a DgcmNet or the path of its weight file.
+    /// Ctrl-C interrupts it; experiences encoded until then are kept.
     ///
-    /// Raises ValueError when out is this store, or for an experience of another size than the network wants.
+    /// Raises ValueError when out is this store, or for an experience whose crop is not of the network's size.
     fn refresh(&self, py: Python<'_>, out: PathBuf, weights: &Bound<'_, PyAny>) -> PyResult<usize> {
         let model = network_of(py, weights)?;
         let out = file_of("out", out)?;
         let same =
             |a: &Path, b: &Path| matches!((a.canonicalize(), b.canonicalize()), (Ok(a), Ok(b)) if a == b);
         if same(&out, &self.path) {
-            return Err(bad("out", "another file than the store itself", out.display().to_string()));
+            return Err(bad("out", "a file other than the store itself", out.display().to_string()));
         }
         self.with(py, move |opened, stop| {
             let mut target = SqliteStore::create(&out)?;
@@ -255,8 +258,9 @@ impl ExperienceStore {
         })
     }
 
-    /// Writes all experiences as files of a folder, 000001.png and 000001.json, ...: an image, and everything else. How
-    /// many were written, and for each that cannot be read why. Ctrl-C is heard.
+    /// Writes all experiences to a folder as 000001.png, 000001.json, and so on: an image, and a description with all numbers.
+    ///
+    /// Returns the number of experiences written, and a list with the reason for each that cannot be read. Ctrl-C interrupts it.
     ///
     /// Raises OSError when a file cannot be written.
     fn export(&self, py: Python<'_>, folder: PathBuf) -> PyResult<(usize, Vec<String>)> {
@@ -288,13 +292,15 @@ impl ExperienceStore {
         })?
     }
 
-    /// The experiences whose features are nearest to one, nearest first: dicts with id, angle (the stored in-plane copy's
-    /// turn about the optical axis, radians), distance (Euclidean; `propose_grasps` weighs by exp(-distance)).
+    /// Finds the experiences with the features nearest to a given one, nearest first.
     ///
-    /// feature (256,): what DgcmNet.feature made; part: only experiences on parts of this name; without_object: not those
-    /// with an object of this name.
+    /// feature: (256,), from DgcmNet.feature. count: maximum number of results. part: only experiences with a part of this name.
+    /// without_object: leave out experiences with an object of this name.
     ///
-    /// Raises ValueError for a feature that is none, a store without network.
+    /// Returns dicts with id, angle (rotation of the stored in-plane copy about the optical axis, radians) and distance (Euclidean;
+    /// `propose_grasps` weights experiences by exp(-distance)).
+    ///
+    /// Raises ValueError for an invalid feature or a store without a network.
     #[pyo3(signature = (feature, count=10, *, part=None, without_object=None, weights=None))]
     fn nearest<'py>(
         &self,
@@ -328,7 +334,7 @@ impl ExperienceStore {
     }
 }
 
-/// A Match in Python's words.
+/// A Match with the names used in Python.
 #[derive(serde::Serialize)]
 struct Near {
     id: i64,
@@ -336,12 +342,12 @@ struct Near {
     distance: f64,
 }
 
-/// A path, unless it is the address of a server, which must not become a file whose name holds a password.
+/// A path. The address of a server is refused: it must not become a file with a password in its name.
 fn file_of(argument: &str, path: PathBuf) -> PyResult<PathBuf> {
     match StorePlace::from(path.into_os_string()) {
         StorePlace::File(path) => Ok(path),
         place => {
-            Err(bad(argument, "the path of a file; servers are for the program `sixfold`", place.to_string()))
+            Err(bad(argument, "a file's path; only the program `sixfold` uses servers", place.to_string()))
         }
     }
 }
@@ -351,7 +357,7 @@ fn now() -> i64 {
     SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |d| d.as_secs() as i64)
 }
 
-/// A Grasp, or what one needs to be stored.
+/// The grasp to store, from a Grasp or from a pose with opening and width.
 fn grasp_of(grasp: &Bound<'_, PyAny>, opening: Option<f64>, width: Option<f64>) -> PyResult<Grasp> {
     let quality = AntipodalQuality { alignment: 0.0, support: 0.0, centring: 0.0, observed: 0.0 };
     let (pose, known) = match grasp.cast::<PyGrasp>() {

@@ -1,4 +1,4 @@
-//! `Experience`: what a store kept of one grasp.
+//! `Experience`: one successful grasp of a store.
 
 use numpy::{PyArray1, PyArray2, PyArray3};
 use pyo3::prelude::*;
@@ -8,7 +8,7 @@ use sixfold::geometry::Image;
 use crate::arrays::{self, about};
 use crate::camera::PyCamera;
 
-/// A grasp that worked, as an ExperienceStore kept it: the object cut out of its depth image, and what the gripper did.
+/// A successful grasp in an ExperienceStore: the object, cropped from its depth image, and the pose of the gripper.
 ///
 /// >>> experience = store.get(1)  # doctest: +SKIP
 /// >>> experience.picture().shape  # doctest: +SKIP
@@ -36,19 +36,19 @@ impl PyExperience {
         self.0.id
     }
 
-    /// Seconds since 1970.
+    /// Time of the experience, seconds since 1970.
     #[getter]
     fn time(&self) -> i64 {
         self.0.experience.time
     }
 
-    /// What was grasped.
+    /// Name of the grasped object.
     #[getter]
     fn object(&self) -> &str {
         &self.0.experience.object
     }
 
-    /// The part that was grasped, or None.
+    /// Name of the grasped part, or None.
     #[getter]
     fn part(&self) -> Option<&str> {
         self.0.experience.part.as_deref()
@@ -60,31 +60,31 @@ impl PyExperience {
         &self.0.experience.gripper.name
     }
 
-    /// Where it comes from, in words.
+    /// Origin of the experience, as text.
     #[getter]
     fn provenance(&self) -> &str {
         &self.0.experience.provenance
     }
 
-    /// The network that made the feature.
+    /// Fingerprint of the network that computed the feature.
     #[getter]
     fn network(&self) -> &str {
         &self.0.experience.network
     }
 
-    /// Distance of the pads before closing, metres.
+    /// Distance between the pads before closing, metres.
     #[getter]
     fn opening(&self) -> f64 {
         self.0.experience.opening
     }
 
-    /// Distance of the contacts, metres.
+    /// Distance between the contacts, metres.
     #[getter]
     fn width(&self) -> f64 {
         self.0.experience.width
     }
 
-    /// The gripper when it closed, (4, 4) float64, metres.
+    /// Pose of the gripper when it closed, (4, 4) float64, metres.
     #[getter]
     fn camera_from_gripper<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
         arrays::from_pose(py, &self.0.experience.camera_from_gripper)
@@ -96,13 +96,14 @@ impl PyExperience {
         PyCamera(self.0.experience.crop.camera)
     }
 
-    /// What the object stood on: unit normal and offset along it in metres, camera's frame; None where that is not known.
+    /// Plane on which the object stood: unit normal (three numbers) and signed distance from the origin along the normal in metres,
+    /// in the camera's frame. None if unknown.
     #[getter]
     fn table(&self) -> Option<(f64, f64, f64, f64)> {
         self.0.experience.crop.table.map(|t| (t.normal.x, t.normal.y, t.normal.z, t.offset))
     }
 
-    /// Which pixels show the object, (side, side) bool.
+    /// Pixels that show the object, (side, side) bool.
     #[getter]
     fn mask<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<bool>>> {
         arrays::from_image(py, self.image(&self.0.experience.crop.mask)?)
@@ -114,33 +115,34 @@ impl PyExperience {
         arrays::from_image(py, self.image(&self.0.experience.region)?)
     }
 
-    /// Points in the camera's frame, (side, side, 3) float32, metres; zeros beside the object.
+    /// Points in the camera's frame, (side, side, 3) float32, metres; zero outside the object.
     #[getter]
     fn points<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray3<f32>>> {
         arrays::from_image_of(py, self.image(&self.0.experience.crop.points)?)
     }
 
-    /// Unit normals in the camera's frame, (side, side, 3) float32; zeros beside the object.
+    /// Unit normals in the camera's frame, (side, side, 3) float32; zero outside the object.
     #[getter]
     fn normals<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray3<f32>>> {
         arrays::from_image_of(py, self.image(&self.0.experience.crop.normals)?)
     }
 
-    /// View-dependent normalised object coordinates (equation 6.1), (side, side, 3) float32, -1 to 1.
+    /// View-dependent normalised object coordinates (VD-NOC; dissertation, equation 6.1), (side, side, 3) float32, -1 to 1; zero
+    /// outside the object.
     #[getter]
     fn coordinates<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray3<f32>>> {
         arrays::from_image_of(py, self.image(&self.0.experience.crop.vd_noc)?)
     }
 
-    /// What the network makes of it, (256,) float32.
+    /// Feature of the crop, computed by the network, (256,) float32.
     #[getter]
     fn feature<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f32>> {
         let copies = &self.0.experience.copies;
         PyArray1::from_vec(py, copies.first().map(|c| c.feature.clone()).unwrap_or_default())
     }
 
-    /// Three images side by side, (4 side, 12 side, 3) uint8: normals with the gripper, coordinates, the pixels near the
-    /// gripper.
+    /// Three images side by side, (4 side, 12 side, 3) uint8: the normals with the gripper, the coordinates, and the normals with
+    /// the pixels near the gripper marked.
     fn picture<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray3<u8>>> {
         let picture = crate::guard::free(py, || self.0.experience.picture())?;
         arrays::from_image_of(py, picture.map_err(about("experience"))?)

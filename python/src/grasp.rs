@@ -1,4 +1,4 @@
-//! Grasps of a parallel-jaw gripper on what a depth image shows (`sixfold-grasp`).
+//! Grasps of a parallel-jaw gripper on objects in a depth image (`sixfold-grasp`).
 
 use numpy::{PyArray2, PyArray3};
 use pyo3::exceptions::PyValueError;
@@ -21,39 +21,40 @@ use crate::guard::interruptible;
 #[pyclass(name = "Grasp", module = "sixfold", frozen)]
 pub(crate) struct PyGrasp {
     pose: Pose,
-    /// Where the gripper closes, (4, 4) float64, metres: takes points of the gripper's frame to the camera's.
+    /// Pose of the gripper when it closes, (4, 4) float64, metres: takes points from the gripper's frame to the camera's.
     #[pyo3(get)]
     camera_from_gripper: Py<PyArray2<f64>>,
-    /// Distance of the pads before closing, metres.
+    /// Distance between the pads before closing, metres.
     #[pyo3(get)]
     opening: f64,
-    /// Distance of the two contacts as far as it is known, metres.
+    /// Distance between the two contacts, as far as known, metres.
     #[pyo3(get)]
     width: f64,
-    /// How good the contacts look, 0 to 1: geometry alone, no forces, no reach.
+    /// Quality of the contacts, 0 to 1, from geometry alone: forces and the robot's reach are not considered.
     #[pyo3(get)]
     quality: f64,
-    /// Part of the quality: how far the closing axis lies inside both friction cones.
+    /// Part of the quality, 0 to 1: how far the closing axis is inside both friction cones.
     #[pyo3(get)]
     alignment: f64,
-    /// Part of the quality: how much surface each pad meets.
+    /// Part of the quality, 0 to 1: the surface area that each pad touches.
     #[pyo3(get)]
     support: f64,
-    /// Part of the quality: how near the closing axis passes to the object's centre.
+    /// Part of the quality, 0 to 1: how close the closing axis passes to the object's centre.
     #[pyo3(get)]
     centring: f64,
-    /// Part of the quality: fraction of the contact points that were seen rather than assumed.
+    /// Part of the quality, 0 to 1: fraction of the contact points that were seen; the others were assumed.
     #[pyo3(get)]
     observed: f64,
-    /// How many proposals were joined into this one.
+    /// Number of proposals in its cluster, which it represents.
     #[pyo3(get)]
     members: usize,
-    /// By what grasps are ordered: the sum of their qualities; with experience the mean of quality and agreement, 0 to 1.
+    /// Score by which grasps are ranked. Without experience: the sum of the qualities in its cluster. With experience: the success
+    /// probability, 0 to 1; with `part` multiplied by a weight, 0 to 1, for holding that part.
     #[pyo3(get)]
     score: f64,
-    /// What experience says of it, a dict, or None for grasps by geometry alone: kind ("geometry" or "experience", where
-    /// the grasp comes from), agreement (of experience that agrees with it, 0 to 1), id (of the experience that it was
-    /// transferred from, or None), distance (of the features), hypothesis (what was assumed about the size).
+    /// Evidence from experience, a dict, or None without `experiences`. kind: origin of the grasp, "geometry" or "experience";
+    /// agreement: fraction of experience that agrees with it, 0 to 1. Of a transferred grasp, otherwise None: id of the experience,
+    /// distance between the features, hypothesis (the assumption about the object's size or rotation).
     #[pyo3(get)]
     experience: Option<Py<PyDict>>,
 }
@@ -91,7 +92,7 @@ impl PyGrasp {
     }
 }
 
-/// A grasp with its rank's numbers, before it becomes Python's.
+/// A grasp with its score, before it is converted to Python.
 struct Proposed {
     grasp: Grasp,
     score: f64,
@@ -99,12 +100,12 @@ struct Proposed {
     experience: Option<Experienced>,
 }
 
-/// What experience says of a grasp.
+/// Evidence from experience for a grasp.
 #[derive(Clone, Copy)]
 struct Experienced {
     kind: &'static str,
     agreement: f64,
-    /// Number, distance and hypothesis of the experience that it was transferred from.
+    /// The experience from which it was transferred: number, distance between the features, hypothesis.
     from: Option<(i64, f64, &'static str)>,
 }
 
@@ -139,11 +140,11 @@ pub(crate) fn view_error(error: ViewError) -> PyErr {
     PyValueError::new_err(format!("{argument}: {error}"))
 }
 
-/// What stands on the table of a depth image: a list of masks (H, W) bool, the largest first.
+/// Finds the objects on the table in a depth image: a list of masks (H, W) bool, the largest first.
 ///
-/// depth (H, W) in metres, without lens distortion. Ctrl-C is heard.
+/// depth (H, W) in metres, without lens distortion. Ctrl-C interrupts it.
 ///
-/// Raises ValueError when there is no table, for a depth in the wrong unit or without any value.
+/// Raises ValueError if no table is found, or for a depth image in the wrong unit or without any value.
 ///
 /// >>> masks = find_objects(depth, camera)  # doctest: +SKIP
 #[pyfunction]
@@ -161,19 +162,20 @@ pub(crate) fn find_objects<'py>(
     masks.into_iter().map(|mask| arrays::from_image(py, mask)).collect()
 }
 
-/// Grasps on an object of a depth image, from its geometry alone: two contacts within the friction cones, fingers and palm
-/// free of what was seen (Nguyen 1988). A list of Grasp, best first, empty when nothing fits.
+/// Proposes grasps on an object in a depth image: two contacts within the friction cones, with fingers and palm free of visible
+/// surfaces (Nguyen 1988). Returns a list of Grasp, best first; empty if there is none.
 ///
-/// depth (H, W) in metres, without lens distortion; mask (H, W) bool of the object, or None for the largest thing on the
-/// table; gripper: a Gripper or the name of one that comes along; most: so many at most; seen_only=True assumes nothing
-/// about the hidden side. With `experiences`, an ExperienceStore, grasps that worked are transferred to the object and
-/// ranked together with the planner's (dissertation, sections 6.2.3 and 6.3.2), by the chance to hold where the store knows what
-/// came of attempts; weights: a DgcmNet or the path of its file in place of the store's; part: only experiences on parts of
-/// this name, such as "handle", and only grasps that hold what they held. The same input and seed give the same result. Ctrl-C
-/// is heard.
+/// depth (H, W) in metres, without lens distortion; mask (H, W) bool of the object, or None for the largest object on the table;
+/// gripper: a Gripper or the name of a built-in one, by default "jaws-140"; most: maximum number of grasps. seen_only=True makes no
+/// assumption about the hidden side. The same input and seed give the same result. Ctrl-C interrupts it.
 ///
-/// Raises ValueError for a mask without depth or of several objects, no table, a depth in the wrong unit, a part without
-/// experiences.
+/// experiences: an ExperienceStore. Its successful grasps are transferred to the object and ranked together with the planner's
+/// (dissertation, sections 6.2.3 and 6.3.2), by the success probability that the store's attempts predict (without attempts, those
+/// of the simulation). weights: a DgcmNet or the path of its file, instead of the store's. part: uses only experiences on parts of
+/// this name, such as "handle", and returns only grasps on the same part; empty if there is no such experience.
+///
+/// Raises ValueError for a mask without depth or of several objects, if no table is found, for a depth image in the wrong unit, for
+/// weights or part without `experiences`, and for `experiences` without any weights.
 ///
 /// >>> best = propose_grasps(depth, camera, gripper="jaws-85")[0]  # doctest: +SKIP
 /// >>> learnt = propose_grasps(depth, camera, experiences=store)[0]  # doctest: +SKIP
@@ -206,7 +208,7 @@ pub(crate) fn propose_grasps(
         Some(store) => Some((store.get().network(py, weights)?, store.get().share())),
         None if weights.is_some() || part.is_some() => {
             let argument = if part.is_some() { "part" } else { "weights" };
-            return Err(bad(argument, "experiences, which it belongs to", "none"));
+            return Err(bad(argument, "experiences, to which it applies", "none"));
         }
         None => None,
     };
@@ -294,9 +296,10 @@ impl GraspError {
     }
 }
 
-/// Grippers drawn over an image at their grasps, the first in green and on top: (H, W, 3) uint8.
+/// Draws grippers at their grasps over an image, the first in green and on top: (H, W, 3) uint8.
 ///
-/// rgb (H, W, 3) uint8; depth (H, W) in metres: behind what it shows the grippers are fainter.
+/// rgb (H, W, 3) uint8; gripper: as for propose_grasps; depth (H, W) in metres: grippers are fainter where they are behind a
+/// measured surface.
 ///
 /// Raises ValueError for images of another size than the camera's.
 ///

@@ -1,4 +1,4 @@
-//! `Gripper`: a parallel-jaw gripper from a file or by its name (`sixfold-grasp`).
+//! `Gripper`: a parallel-jaw gripper from a file, or a built-in one by name (`sixfold-grasp`).
 
 use std::path::PathBuf;
 
@@ -10,8 +10,8 @@ use crate::arrays::{about, bad};
 use crate::guard::os_error;
 use crate::mesh::PyMesh;
 
-/// A parallel-jaw gripper: sizes in metres, forces in newtons. Its frame: the origin midway between the finger tips, z the
-/// approach direction, x the closing direction. Made by `load` from a file or by `built_in` from a name.
+/// A parallel-jaw gripper: sizes in metres, forces in newtons. The origin of its frame is midway between the finger tips; z is the
+/// approach direction, x the closing direction. Created by `load` from a file or by `built_in` from a name.
 ///
 /// >>> gripper = Gripper.built_in("jaws-85")
 /// >>> gripper.max_opening
@@ -21,9 +21,9 @@ pub(crate) struct PyGripper(Gripper);
 
 #[pymethods]
 impl PyGripper {
-    /// Reads a gripper file (JSON, as crates/sixfold-grasp/grippers/jaws-85.json is one).
+    /// Reads a gripper file (JSON; an example is crates/sixfold-grasp/grippers/jaws-85.json).
     ///
-    /// Raises OSError when the file cannot be read, ValueError with the field for sizes that no gripper has.
+    /// Raises OSError when the file cannot be read, and ValueError, naming the field, for sizes that are not possible.
     #[staticmethod]
     fn load(path: PathBuf) -> PyResult<Self> {
         read_gripper(&path).map(PyGripper).map_err(|error| match &error {
@@ -32,7 +32,7 @@ impl PyGripper {
         })
     }
 
-    /// A gripper that comes along: "jaws-140" or "jaws-85".
+    /// A built-in gripper: "jaws-140" or "jaws-85".
     ///
     /// Raises ValueError for another name.
     #[staticmethod]
@@ -41,7 +41,7 @@ impl PyGripper {
         gripper.map(PyGripper).ok_or_else(|| bad("name", Gripper::BUILT_IN.join(" or "), format!("{name:?}")))
     }
 
-    /// What it is called.
+    /// Name of the gripper.
     #[getter]
     fn name(&self) -> &str {
         &self.0.name
@@ -53,7 +53,7 @@ impl PyGripper {
         self.0.max_opening
     }
 
-    /// From the palm to the finger tips, metres.
+    /// Length of the fingers, from the palm to the tips, metres.
     #[getter]
     fn finger_length(&self) -> f64 {
         self.0.finger_length
@@ -77,9 +77,9 @@ impl PyGripper {
         self.0.friction
     }
 
-    /// The gripper as a Mesh in its own frame, the pads `opening` metres apart, for images.
+    /// The gripper as a Mesh in its own frame, for images, with the pads `opening` metres apart.
     ///
-    /// Raises ValueError for an opening that it does not have.
+    /// Raises ValueError for an opening outside 0 to max_opening.
     fn mesh(&self, opening: f64) -> PyResult<PyMesh> {
         if !(0.0..=self.0.max_opening).contains(&opening) {
             let expected = format!("0 to {} m", self.0.max_opening);
@@ -93,7 +93,7 @@ impl PyGripper {
     }
 }
 
-/// A Gripper, the name of one that comes along, or the default one.
+/// A Gripper, a built-in one by name, or the default one.
 pub(crate) fn gripper_of(argument: Option<&Bound<'_, PyAny>>) -> PyResult<Gripper> {
     let name = match argument {
         None => Gripper::BUILT_IN[0].to_owned(),

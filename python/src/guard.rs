@@ -1,4 +1,4 @@
-//! Work outside the interpreter lock: panics become `RuntimeError`, Ctrl-C is heard, file errors become `OSError`.
+//! Work without the interpreter lock: panics become `RuntimeError`, Ctrl-C interrupts, file errors become `OSError`.
 
 use std::any::Any;
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
@@ -13,7 +13,7 @@ use sixfold::bop::{DatasetError, EvalError, ResultsError};
 use sixfold::io::{CameraFileError, ImageFileError};
 use sixfold::mesh::MeshFileError;
 
-/// How often Ctrl-C is looked for.
+/// Interval between checks for Ctrl-C.
 const LISTEN: Duration = Duration::from_millis(20);
 
 fn internal(payload: &(dyn Any + Send)) -> PyErr {
@@ -30,30 +30,30 @@ pub(crate) fn free<T: Send>(py: Python<'_>, work: impl FnOnce() -> T + Send) -> 
     py.detach(|| catch_unwind(AssertUnwindSafe(work))).map_err(|payload| internal(payload.as_ref()))
 }
 
-/// What ends work that was asked to stop where it only has a callback.
+/// Payload of the unwinding that ends work from within a callback, when it is asked to stop.
 struct Stopped;
 
-/// Asked to stop: work calls [`Stop::check`] where it can be left, or looks at [`Stop::flag`].
+/// A request to stop: work calls [`Stop::check`] where it can be left, or reads [`Stop::flag`].
 #[derive(Clone)]
 pub(crate) struct Stop(Arc<AtomicBool>);
 
 impl Stop {
-    /// Leaves the work when Ctrl-C was pressed: unwinds without a message, and [`interruptible`] catches it.
+    /// Ends the work if it was interrupted: unwinds without a message; [`reporting`] catches it.
     pub(crate) fn check(&self) {
         if self.0.load(Ordering::Relaxed) {
             resume_unwind(Box::new(Stopped));
         }
     }
 
-    /// Set once Ctrl-C was pressed, for work that ends by itself then.
+    /// Set when the work is interrupted, for work that then ends by itself.
     pub(crate) fn flag(&self) -> &AtomicBool {
         &self.0
     }
 }
 
-/// Runs long work on a thread of its own without the interpreter lock and raises what a signal handler raises
-/// (`KeyboardInterrupt`) while it runs. The call then returns at once: work that looks at [`Stop`] ends soon, other work
-/// when it is done, and nobody sees its result.
+/// Runs long work on its own thread, without the interpreter lock, and raises what a signal handler raises meanwhile
+/// (`KeyboardInterrupt`). The call then returns at once. Work that checks [`Stop`] ends soon, other work when it is done; its
+/// result is discarded.
 pub(crate) fn interruptible<T: Send + 'static>(
     py: Python<'_>,
     work: impl FnOnce(&Stop) -> T + Send + 'static,
@@ -61,16 +61,16 @@ pub(crate) fn interruptible<T: Send + 'static>(
     reporting(py, Leave::AtOnce, move |stop, _: &Tell<()>| work(stop), |()| Ok(()))
 }
 
-/// When a call that was interrupted returns.
+/// When an interrupted call returns.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Leave {
-    /// At once; what cannot be stopped half-way ends in the background.
+    /// At once; work that cannot be stopped halfway ends in the background.
     AtOnce,
-    /// When the work has ended, because it has something to put on the disk; at once when interrupted again.
+    /// When the work has ended, because it writes to disk; at once when interrupted again.
     WhenDone,
 }
 
-/// How work tells of its progress.
+/// Reports the progress of work.
 pub(crate) struct Tell<U>(Box<dyn Fn(U) + Send + Sync>);
 
 impl<U> Tell<U> {
@@ -84,8 +84,8 @@ enum Message<T, U> {
     Done(std::thread::Result<T>),
 }
 
-/// As [`interruptible`], for work that tells of its progress: `handle_update` gets it with the interpreter lock, and an error of it
-/// (what a user's callback raises) stops the work like Ctrl-C does.
+/// As [`interruptible`], for work that reports its progress: `handle_update` is called with each report while the interpreter lock
+/// is held. Its error (an exception in a user's callback) stops the work as Ctrl-C does.
 pub(crate) fn reporting<T: Send + 'static, U: Send + 'static>(
     py: Python<'_>,
     leave: Leave,
@@ -98,14 +98,14 @@ pub(crate) fn reporting<T: Send + 'static, U: Send + 'static>(
     std::thread::Builder::new()
         .name("sixfold".to_owned())
         .spawn(move || {
-            // The receiver is gone when the call was left; then nobody wants news or result.
+            // If the call has already returned, the receiver is gone: reports and result are discarded.
             let update = send.clone();
             let tell = Tell(Box::new(move |value| drop(update.send(Message::Progress(value)))));
             let result = catch_unwind(AssertUnwindSafe(|| work(&flag, &tell)));
             let _ = send.send(Message::Done(result));
         })
         .map_err(|error| PyOSError::new_err(format!("no thread could be started: {error}")))?;
-    // What ends the call, once the work has ended.
+    // The error that the call raises once the work has ended.
     let mut pending: Option<PyErr> = None;
     loop {
         let answer;
@@ -123,7 +123,7 @@ pub(crate) fn reporting<T: Send + 'static, U: Send + 'static>(
             Err(RecvTimeoutError::Timeout) => Ok(()),
             Err(RecvTimeoutError::Disconnected) => {
                 return Err(PyRuntimeError::new_err(
-                    "internal error in sixfold: the work ended without an answer",
+                    "internal error in sixfold: the work ended without a result",
                 ));
             }
         };
@@ -137,7 +137,7 @@ pub(crate) fn reporting<T: Send + 'static, U: Send + 'static>(
     }
 }
 
-/// `OSError` (or the fitting child of it) with a message that names the file.
+/// `OSError`, or its matching subclass, with a message that names the file.
 pub(crate) fn os_error(kind: std::io::ErrorKind, message: String) -> PyErr {
     match kind {
         std::io::ErrorKind::NotFound => PyFileNotFoundError::new_err(message),
@@ -146,7 +146,7 @@ pub(crate) fn os_error(kind: std::io::ErrorKind, message: String) -> PyErr {
     }
 }
 
-/// A mesh file that cannot be read or written.
+/// The exception for a mesh file that cannot be read or written.
 pub(crate) fn mesh_file_error(error: MeshFileError) -> PyErr {
     match &error {
         MeshFileError::Io { source, .. } => os_error(source.kind(), error.to_string()),
@@ -154,7 +154,7 @@ pub(crate) fn mesh_file_error(error: MeshFileError) -> PyErr {
     }
 }
 
-/// A dataset that cannot be read or written.
+/// The exception for a dataset that cannot be read or written.
 pub(crate) fn dataset_error(error: DatasetError) -> PyErr {
     match error {
         DatasetError::Read { ref source, .. } | DatasetError::Write { ref source, .. } => {
@@ -171,7 +171,7 @@ pub(crate) fn dataset_error(error: DatasetError) -> PyErr {
     }
 }
 
-/// An image file that cannot be read or written.
+/// The exception for an image file that cannot be read or written.
 pub(crate) fn image_error(error: ImageFileError) -> PyErr {
     match &error {
         ImageFileError::Read { source, .. } | ImageFileError::Write { source, .. } => {
@@ -181,7 +181,7 @@ pub(crate) fn image_error(error: ImageFileError) -> PyErr {
     }
 }
 
-/// A camera file that cannot be used.
+/// The exception for a camera file that cannot be used.
 pub(crate) fn camera_file_error(error: CameraFileError) -> PyErr {
     match &error {
         CameraFileError::Read { source, .. } => os_error(source.kind(), error.to_string()),
@@ -189,7 +189,7 @@ pub(crate) fn camera_file_error(error: CameraFileError) -> PyErr {
     }
 }
 
-/// A result file that cannot be read or written.
+/// The exception for a result file that cannot be read or written.
 pub(crate) fn results_error(error: ResultsError) -> PyErr {
     match &error {
         ResultsError::Read { source, .. } | ResultsError::Write { source, .. } => {
@@ -199,7 +199,7 @@ pub(crate) fn results_error(error: ResultsError) -> PyErr {
     }
 }
 
-/// An evaluation that cannot be done.
+/// The exception for an evaluation that cannot be done.
 pub(crate) fn eval_error(error: EvalError) -> PyErr {
     match error {
         EvalError::Dataset(error) => dataset_error(error),

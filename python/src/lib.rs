@@ -1,10 +1,10 @@
-//! The Python package `sixfold`: numpy arrays in, poses out. Every file of this crate turns one part of the library into
-//! Python's terms; nothing is computed here.
+//! The Python package `sixfold`: numpy arrays in, poses out. Each file of this crate exposes one part of the library to Python;
+//! nothing is computed here.
 //!
-//! Three rules hold for every function: what comes in is checked and refused with a `ValueError` that names the argument;
-//! the interpreter lock is released while the library works; no panic reaches Python (`guard.rs`).
+//! Three rules apply to every function: arguments are checked, and a `ValueError` names the invalid one; the interpreter lock is
+//! released while the library works; no panic reaches Python (`guard.rs`).
 
-// PyO3 hands over arguments by value, and a Python call has as many as it needs.
+// PyO3 passes arguments by value, and a Python function has as many as it needs.
 #![allow(clippy::needless_pass_by_value)]
 
 mod align;
@@ -44,7 +44,7 @@ pyo3::create_exception!(
     sixfold,
     NoSolutionError,
     PyValueError,
-    "The input is well formed, but nothing fits it: no pose agrees with enough correspondences, too few points find a partner."
+    "The input is valid but has no solution: no pose agrees with enough correspondences, or too few points have one."
 );
 
 /// The compiled part of the package `sixfold`.

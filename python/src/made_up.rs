@@ -1,4 +1,4 @@
-//! `made_up_mesh`, `drop_objects`: objects of no mesh file (`sixfold-synth`), and scenes of objects that fell on a table
+//! `made_up_mesh`, `drop_objects`: synthetic objects (`sixfold-synth`), and scenes of objects dropped on a table
 //! (`sixfold-simulation`).
 
 use numpy::PyArray2;
@@ -13,8 +13,8 @@ use crate::guard::{free, interruptible};
 use crate::mesh::PyMesh;
 use crate::trial::{PySolid, simulation_error};
 
-/// Draws a synthetic object, a Mesh in metres: of a household family, "can", "mug", "cup", "bottle", "bowl", "box", "clamp" or
-/// "drill", or a "toy", which is of none. Another seed gives another one.
+/// Generates a synthetic object, a Mesh in metres. kind: a household family ("can", "mug", "cup", "bottle", "bowl", "box", "clamp"
+/// or "drill"), or "toy", which belongs to no family. Each seed gives a different object.
 ///
 /// Raises ValueError for another kind.
 ///
@@ -36,13 +36,14 @@ pub(crate) fn made_up_mesh(py: Python<'_>, kind: &str, seed: i64) -> PyResult<Py
     Ok(PyMesh::with_info(mesh.map_err(about("kind"))?, None))
 }
 
-/// Lets objects fall on a table, in a physics engine: where each of them comes to rest, world_from_object (4, 4) in metres, z
-/// up, the table's top at z = 0; None for what rolled away or does not come to rest.
+/// Drops objects on a table in a physics simulation. Returns the pose of each at rest, world_from_object (4, 4) in metres, z up,
+/// the table top at z = 0; None for an object that rolls away or does not come to rest.
 ///
-/// solids: Solids, the same one as often as wanted. radius of the disc around the origin over which they are let go, reach
-/// beyond which they are taken away, metres; upright: fraction of them that start with their z axis up, the others in any
-/// orientation; stacked: fraction that falls wherever it falls, the others look for a free place. The same arguments give the same
-/// result on every machine. Ctrl-C is heard.
+/// solids: a list of Solids, which may contain the same one several times. radius: radius of the disc around the origin over which
+/// objects are dropped, metres; reach: objects further than this from the origin are removed, metres. upright: fraction of the
+/// objects that start with their z axis up; the others start in any orientation. stacked: fraction of those others that are dropped
+/// at any place; all other objects are put at a free place, if one is found. The same arguments give the same result on every
+/// machine. Ctrl-C interrupts it.
 ///
 /// Raises ValueError for options out of range.
 ///

@@ -1,4 +1,4 @@
-//! `Mesh`: a checked triangle mesh in metres with the symmetries of its object.
+//! `Mesh`: a checked triangle mesh in metres, with the symmetries of its object.
 
 use std::path::PathBuf;
 use std::sync::{Arc, OnceLock};
@@ -17,14 +17,15 @@ use sixfold::mesh::{
 use crate::arrays::{self, about, bad, positive, seed, whole};
 use crate::guard::{free, interruptible, mesh_file_error};
 
-/// A triangle mesh in its object's frame, in metres; without faces a list of points. It cannot be changed.
+/// A triangle mesh in its object's frame, in metres; without faces, a point cloud. It cannot be changed.
 ///
-/// vertices (N, 3) metres; faces (F, 3) vertex indices, counter-clockwise seen from outside; normals (N, 3) unit;
-/// colors (N, 3) uint8; texcoords (N, 2), v up, with texture (H, W, 3) uint8. symmetries (S, 4, 4) are transformations
-/// under which the object looks the same (the identity is added); symmetry_axes a list of (direction, point) about
-/// which it may turn freely.
+/// vertices (N, 3) metres; faces (F, 3) vertex indices, counter-clockwise seen from outside; normals (N, 3) unit; colors (N, 3)
+/// uint8; texcoords (N, 2), v up, with texture (H, W, 3) uint8. symmetries (S, 4, 4): transformations that map the object onto
+/// itself (the identity is added); symmetry_axes: a list of (direction, point), axes about which it is symmetric under any
+/// rotation.
 ///
-/// Raises ValueError for no vertex, numbers that are not finite, faces that name a missing vertex.
+/// Raises ValueError if there is no vertex, for numbers that are not finite, faces with an invalid vertex index, and texcoords or
+/// texture without the other.
 ///
 /// >>> triangle = Mesh([[0, 0, 0], [0.03, 0, 0], [0, 0.04, 0]], [[0, 1, 2]])
 /// >>> triangle.diameter
@@ -64,7 +65,7 @@ impl PyMesh {
         }
     }
 
-    /// Another shape of the same object.
+    /// Another mesh with the symmetries of this one.
     fn like(&self, mesh: Mesh) -> Self {
         PyMesh::symmetric(mesh, self.discrete.clone(), self.continuous.clone())
     }
@@ -77,7 +78,7 @@ impl PyMesh {
         self.turns().symmetry_poses(max_step)
     }
 
-    /// The symmetries as the library takes them; size and diameter do not matter to them.
+    /// The symmetries as the library expects them; they do not depend on size and diameter.
     fn turns(&self) -> ModelInfo {
         ModelInfo {
             diameter: 1.0,
@@ -88,13 +89,13 @@ impl PyMesh {
         }
     }
 
-    /// What is known of the object.
+    /// Diameter, bounding box and symmetries of the object.
     pub(crate) fn info(&self) -> ModelInfo {
         let (symmetries_discrete, symmetries_continuous) = (self.discrete.clone(), self.continuous.clone());
         ModelInfo { symmetries_discrete, symmetries_continuous, ..ModelInfo::of_mesh(&self.mesh) }
     }
 
-    /// The vertices as the pose errors need them.
+    /// The vertices in the form that the pose errors need.
     pub(crate) fn model_points(&self) -> PyResult<Arc<ModelPoints>> {
         if let Some(points) = self.points.get() {
             return Ok(points.clone());
@@ -105,7 +106,7 @@ impl PyMesh {
     }
 }
 
-/// Checks what the library takes for granted of a turn axis.
+/// A symmetry axis with the properties that the library assumes.
 fn symmetry_axis(entry: &Bound<'_, PyAny>) -> PyResult<ContinuousSymmetry> {
     let parts = || entry.extract::<(Bound<'_, PyAny>, Bound<'_, PyAny>)>();
     let (axis, offset) =
@@ -178,12 +179,12 @@ impl PyMesh {
         Ok(PyMesh::symmetric(mesh, discrete, continuous))
     }
 
-    /// Reads a PLY, OBJ, STL, glTF/GLB or XYZ file. `unit` is that of the file's numbers: "m", "mm", "cm" or "in"; files
-    /// do not say it.
+    /// Reads a PLY, OBJ, STL, glTF/GLB or XYZ file. `unit` is the unit of the lengths in the file, "m", "mm", "cm" or "in"; files
+    /// do not state it.
     ///
-    /// Raises OSError when the file cannot be read; ValueError when it is broken, or with check_size when the object
-    /// would be smaller than 5 mm or larger than 5 m (the message states which unit fits). Textures, materials and buffers
-    /// that the file names are read at or below its folder only, anywhere with allow_outside.
+    /// Raises OSError when the file cannot be read; ValueError when it is broken, or, with check_size, when the object would be
+    /// smaller than 5 mm or larger than 5 m (the message states which unit fits). Textures, materials and buffers that the file
+    /// names are read only from its folder and below; with allow_outside, from anywhere.
     ///
     /// >>> Mesh.load("data/demo/models/obj_000001.ply", unit="mm").diameter  # doctest: +SKIP
     /// 0.10209...
@@ -204,8 +205,9 @@ impl PyMesh {
         Ok(PyMesh::plain(mesh))
     }
 
-    /// Writes a PLY file in `unit` ("m", "mm", "cm", "in"), lengths as 32 bit floats; a texture becomes a PNG beside it.
-    /// The file is replaced as a whole or not at all. Raises OSError, or ValueError for coordinates that do not fit.
+    /// Writes a PLY file with lengths in `unit` ("m", "mm", "cm", "in") as 32-bit floats, binary or as text. A texture becomes a
+    /// PNG file beside it. Each file is replaced as a whole or not at all. Raises OSError, or ValueError for coordinates that do
+    /// not fit a 32-bit float.
     ///
     /// >>> mesh.save("cup.ply", unit="mm")  # doctest: +SKIP
     #[pyo3(signature = (path, unit, *, binary=true))]
@@ -227,19 +229,19 @@ impl PyMesh {
         arrays::from_rows(py, self.mesh.faces().to_vec())
     }
 
-    /// Unit normals per vertex, (N, 3) float64, or None.
+    /// Unit normals of the vertices, (N, 3) float64, or None.
     #[getter]
     fn normals<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyArray2<f64>>>> {
         self.mesh.normals().map(|n| arrays::from_points3(py, n)).transpose()
     }
 
-    /// Colours per vertex, (N, 3) uint8, or None.
+    /// Colours of the vertices, (N, 3) uint8, or None.
     #[getter]
     fn colors<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyArray2<u8>>>> {
         self.mesh.colors().map(|c| arrays::from_rows(py, c.to_vec())).transpose()
     }
 
-    /// Texture coordinates per vertex, (N, 2) float32, v up, or None.
+    /// Texture coordinates of the vertices, (N, 2) float32, v up, or None.
     #[getter]
     fn texcoords<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyArray2<f32>>>> {
         self.mesh.texcoords().map(|c| arrays::from_rows(py, c.to_vec())).transpose()
@@ -251,20 +253,20 @@ impl PyMesh {
         self.mesh.texture().map(|t| arrays::from_image_of(py, t.clone())).transpose()
     }
 
-    /// The largest distance between two vertices in metres, exact.
+    /// Diameter: the largest distance between two vertices, metres, exact.
     #[getter]
     fn diameter(&self, py: Python<'_>) -> PyResult<f64> {
         free(py, || self.known_diameter())
     }
 
-    /// Transformations under which the object looks the same, (S, 4, 4), the identity first: each discrete one
-    /// followed by 315 steps of every axis, as BOP's evaluation discretises them (Hodan et al. 2020, section 2.2).
+    /// Transformations that map the object onto itself, (S, 4, 4), the identity first: the identity and each discrete one, each
+    /// followed by 315 steps about every axis, as BOP's evaluation discretises them (Hodan et al. 2020, section 2.2).
     #[getter]
     fn symmetries<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray3<f64>>> {
         arrays::from_poses(py, &self.symmetry_poses(ModelInfo::BOP_MAX_STEP))
     }
 
-    /// The axes about which the object may turn freely: a list of (direction (3,), point (3,) in metres).
+    /// Axes about which the object is symmetric under any rotation: a list of (direction (3,), point (3,) in metres).
     #[getter]
     fn symmetry_axes<'py>(&self, py: Python<'py>) -> Vec<Axis<'py>> {
         let axes = self.continuous.iter();
@@ -292,28 +294,28 @@ impl PyMesh {
         })
     }
 
-    /// Corners of the axis-parallel bounding box, (2, 3): smallest, largest; metres.
+    /// Corners of the axis-aligned bounding box, (2, 3), metres: smallest and largest coordinates.
     #[getter]
     fn bounding_box<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
         let (low, high) = self.mesh.bounding_box();
         arrays::from_points3(py, &[low, high])
     }
 
-    /// The area of all faces in square metres.
+    /// Area of all faces, square metres.
     #[getter]
     fn surface_area(&self) -> f64 {
         self.mesh.surface_area()
     }
 
-    /// A unit normal for every vertex, (N, 3): those given, or computed from the faces by angle (Thuermer and
-    /// Wuethrich 1998); zero where there is no face.
+    /// A unit normal for every vertex, (N, 3): those given, or computed from the faces, each weighted by its angle at the vertex
+    /// (Thuermer and Wuethrich 1998); zero where there is no face.
     fn vertex_normals<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
         let normals = free(py, || self.mesh.vertex_normals())?;
         arrays::from_points3(py, &normals)
     }
 
-    /// `count` points spread evenly by area (Osada et al. 2002): points (n, 3), unit normals (n, 3), faces (n,). The
-    /// same seed gives the same points; a mesh without area gives none.
+    /// Samples `count` points of the surface, uniformly by area (Osada et al. 2002): points (n, 3), unit normals (n, 3), face
+    /// indices (n,). The same seed gives the same points; a mesh without area gives none.
     ///
     /// >>> triangle = Mesh([[0, 0, 0], [0.03, 0, 0], [0, 0.04, 0]], [[0, 1, 2]])
     /// >>> points, normals, faces = triangle.sample_surface(100)
@@ -339,8 +341,8 @@ impl PyMesh {
         ))
     }
 
-    /// A mesh of at most `faces` faces that follows the shape (Garland and Heckbert 1997). Colours follow, a texture
-    /// becomes vertex colours. Ctrl-C is heard.
+    /// Simplifies the mesh to at most `faces` faces that follow its shape (Garland and Heckbert 1997); more remain when no edge can
+    /// be collapsed without flipping a face. Vertex colours are kept; a texture becomes vertex colours. Ctrl-C interrupts it.
     ///
     /// >>> coarse = mesh.simplify(2000)  # doctest: +SKIP
     fn simplify(&self, py: Python<'_>, faces: i64) -> PyResult<PyMesh> {
@@ -348,18 +350,18 @@ impl PyMesh {
         Ok(self.like(interruptible(py, move |_| sixfold::mesh::simplify(&mesh, faces))?))
     }
 
-    /// The smallest convex body around the vertices (Barber et al. 1996). Raises ValueError when they lie in a plane.
+    /// Convex hull of the vertices (Barber et al. 1996), without colours. Raises ValueError when they lie in a plane.
     fn convex_hull(&self, py: Python<'_>) -> PyResult<PyMesh> {
         Ok(self.like(free(py, || self.mesh.convex_hull())?.map_err(about("mesh"))?))
     }
 
-    /// A mesh of disks through the vertices, to render a point cloud (Pfister et al. 2000). Raises ValueError for fewer
-    /// than four points or points on one line.
+    /// A mesh of discs through the vertices, to render a point cloud (Pfister et al. 2000), without colours. Raises ValueError for
+    /// fewer than four points or for points on a line.
     fn surfels(&self, py: Python<'_>) -> PyResult<PyMesh> {
         Ok(self.like(free(py, || self.mesh.surfels())?.map_err(about("mesh"))?))
     }
 
-    /// The mesh moved by a pose (4, 4), without its symmetries.
+    /// The mesh transformed by a pose (4, 4), without its symmetries.
     fn transformed(&self, pose: &Bound<'_, PyAny>) -> PyResult<PyMesh> {
         Ok(PyMesh::plain(self.mesh.transformed(&arrays::pose("pose", pose)?)))
     }
@@ -369,7 +371,7 @@ impl PyMesh {
         Ok(PyMesh::plain(self.mesh.scaled(positive("factor", factor)?)))
     }
 
-    /// All faces of several meshes in one.
+    /// One mesh with the faces of several, without their symmetries.
     ///
     /// >>> part = Mesh([[0, 0, 0], [0.03, 0, 0], [0, 0.04, 0]], [[0, 1, 2]])
     /// >>> len(Mesh.merged([part, part]).faces)
@@ -411,13 +413,13 @@ impl PyMesh {
     }
 }
 
-/// Makes a mesh again from what pickle kept.
+/// Restores a mesh from its pickled parts.
 #[pyfunction]
 pub(crate) fn _mesh_of<'py>(py: Python<'py>, parts: &Bound<'py, PyDict>) -> PyResult<Bound<'py, PyAny>> {
     py.get_type::<PyMesh>().call((), Some(parts))
 }
 
-/// One symmetry that was found.
+/// A found symmetry as a dict.
 fn found_symmetry<'py>(py: Python<'py>, s: &FoundSymmetry) -> PyResult<Bound<'py, PyDict>> {
     let entry = PyDict::new(py);
     entry.set_item("axis", arrays::from_vector3(py, &s.axis))?;
@@ -433,12 +435,15 @@ fn found_symmetry<'py>(py: Python<'py>, s: &FoundSymmetry) -> PyResult<Bound<'py
     Ok(entry)
 }
 
-/// The rotations that map a mesh onto itself, at least likely by its shape, continuous ones first. `noise`: standard deviation of
-/// the surface in metres, 0.001 for a mesh from photographs.
+/// Finds the rotations that map a mesh onto itself: those that are at least likely by its shape, continuous ones first. `noise`:
+/// standard deviation of the surface in metres, 0.001 for a mesh from photographs.
 ///
-/// A dict each: axis (3,) and a point (3,) of it; order (rotations by multiples of a full turn over it, None: any); deviation_p95
-/// and deviation_max of the rotated surface from itself, metres; color_difference_mean and _p95, 0 to 1, None without colours;
-/// by_shape and by_shape_and_color "sure", "likely" or "none"; poses (order - 1, 4, 4).
+/// Returns a dict for each: axis (3,), a unit direction, and point (3,) on it; order (rotations by multiples of a full rotation
+/// divided by it; None for any rotation); deviation_p95 and deviation_max, distances of the rotated surface from itself, metres;
+/// color_difference_mean and color_difference_p95, 0 to 1, None without colours; by_shape and by_shape_and_color, "sure", "likely"
+/// or "none"; poses (order - 1, 4, 4), empty when order is None.
+///
+/// Raises ValueError for noise outside 0 to 0.02 m or above a fiftieth of the object's diameter.
 ///
 /// >>> slab = Mesh([[0, 0, 0], [0.06, 0, 0], [0.06, 0.04, 0], [0, 0.04, 0]], [[0, 1, 2], [0, 2, 3]])
 /// >>> [s["order"] for s in find_symmetries(slab) if s["by_shape"] == "sure"]

@@ -1,4 +1,4 @@
-//! The methods of `Estimator`: a name, options, and how they become an estimator, as `sixfold estimate` does it.
+//! The methods of `Estimator`: their names and options, and how estimators are made from them, as in `sixfold estimate`.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -21,7 +21,7 @@ use crate::guard::interruptible;
 use crate::mttm::{coverage, matched_by, network};
 use crate::training::file_or_value;
 
-/// The methods' options as they were given.
+/// The methods' options as given.
 pub(crate) struct Options {
     pub weights: Option<PathBuf>,
     pub keep_plane: bool,
@@ -35,7 +35,7 @@ pub(crate) struct Options {
     pub seed: u64,
 }
 
-/// Each method with its own options beside the seed.
+/// Each method with its own options, besides the seed.
 const METHODS: [(&str, &[&str]); 5] = [
     ("ppf", &["keep_plane"]),
     ("mttm", &["keep_plane", "weights", "matcher", "templates_only", "templates"]),
@@ -48,7 +48,7 @@ const METHODS: [(&str, &[&str]); 5] = [
 const BOTH: &str = "both";
 
 impl Options {
-    /// The options that differ from their defaults, by name.
+    /// The options that differ from their defaults: names and values.
     fn given(&self) -> Vec<(&'static str, String)> {
         let all = [
             ("weights", self.weights.as_ref().map(|w| w.display().to_string())),
@@ -64,7 +64,7 @@ impl Options {
         all.into_iter().filter_map(|(name, value)| Some((name, value?))).collect()
     }
 
-    /// The method's name, after it was seen that every given option is one of its own.
+    /// Checks that the method exists and has every given option; returns its name.
     pub fn check(&self, method: &str) -> PyResult<&'static str> {
         let names = || METHODS.map(|(name, _)| format!("{name:?}")).join(" or ");
         let known = METHODS.iter().find(|(name, _)| *name == method);
@@ -73,14 +73,14 @@ impl Options {
             if !own.contains(&option) {
                 let users = METHODS.iter().filter(|(_, own)| own.contains(&option));
                 let users = users.map(|(name, _)| format!("{name:?}")).collect::<Vec<_>>().join(" and ");
-                let expected = format!("its default: it is no option of {method:?}, but of {users}");
+                let expected = format!("its default: it is an option of {users}, not of {method:?}");
                 return Err(bad(option, expected, value));
             }
         }
         Ok(method)
     }
 
-    /// The options that a run over a dataset resumes with.
+    /// The options that are recorded with a run over a dataset; it resumes only with the same ones.
     pub fn record(&self) -> RunOptions {
         let mut record = RunOptions::default();
         for (name, value) in self.given() {
@@ -91,7 +91,7 @@ impl Options {
     }
 }
 
-/// A method, and the ids of the objects that its weights know.
+/// A method's estimator, and the ids of the objects that its weights contain.
 pub(crate) type Made = (Arc<dyn PoseEstimator>, Vec<u32>);
 
 pub(crate) fn make(py: Python<'_>, method: &str, options: &Options) -> PyResult<Made> {

@@ -1,4 +1,4 @@
-//! `sixfold.metrics`: pose errors and scores. Symmetries and points come from a `Mesh` or as arrays.
+//! `sixfold.metrics`: pose errors and scores. Symmetries and points come from a `Mesh` or from arrays.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -54,8 +54,8 @@ fn symmetries(given: Option<&Bound<'_, PyAny>>) -> PyResult<Vec<Pose>> {
     Ok(poses)
 }
 
-/// Average distance of model points (Hinterstoisser et al. 2012), metres: corresponding points. model: a Mesh or points
-/// (N, 3) metres; estimate and ground_truth (4, 4), used as they are, without making the rotation exact.
+/// Average distance between corresponding model points (ADD; Hinterstoisser et al. 2012), metres. model: a Mesh or points (N, 3) in
+/// metres; estimate and ground_truth (4, 4), used as given: their rotations are not orthonormalised.
 ///
 /// >>> import numpy as np
 /// >>> moved = np.eye(4); moved[0, 3] = 0.01
@@ -73,7 +73,7 @@ fn add(
     free(py, || sixfold::bop::add(&points, e, g))
 }
 
-/// As add with the nearest point in place of the corresponding one: ADD-S or ADI, for symmetric objects
+/// As add, with the nearest point at the estimate instead of the corresponding one: ADD-S or ADI, for symmetric objects
 /// (Hinterstoisser et al. 2012), metres.
 ///
 /// >>> import numpy as np
@@ -92,8 +92,8 @@ fn adi(
     free(py, || sixfold::bop::adi(&points, e, g))
 }
 
-/// Maximum symmetry-aware surface distance (Hodan et al. 2020, section 2.2), metres. symmetries (S, 4, 4) with the identity
-/// among them; by default those of the mesh, or the identity alone for points.
+/// Maximum symmetry-aware surface distance (MSSD; Hodan et al. 2020, section 2.2), metres. symmetries (S, 4, 4), including the
+/// identity; by default those of the mesh, or only the identity for points.
 ///
 /// >>> import numpy as np
 /// >>> moved = np.eye(4); moved[0, 3] = 0.01
@@ -113,8 +113,8 @@ fn mssd(
     free(py, || sixfold::bop::mssd(&points, e, g, &turns))
 }
 
-/// Maximum symmetry-aware projection distance (Hodan et al. 2020, section 2.2), pixels of a pinhole camera; infinite when a
-/// vertex lies behind the camera. symmetries as for mssd.
+/// Maximum symmetry-aware projection distance (MSPD; Hodan et al. 2020, section 2.2), pixels of a pinhole camera; infinite when a
+/// vertex lies at or behind the camera. symmetries as for mssd.
 ///
 /// >>> import numpy as np
 /// >>> from sixfold import Camera
@@ -137,10 +137,10 @@ fn mspd(
     free(py, || sixfold::bop::mspd(&points, e, g, &camera.0, &turns))
 }
 
-/// The mean distance in pixels between the projections of corresponding points (Brachmann et al. 2016); infinite when one
-/// lies behind the camera.
+/// Mean distance in pixels between the projections of corresponding points (Brachmann et al. 2016); infinite when a point lies at
+/// or behind the camera.
 ///
-/// Raises ValueError for a pose that is none, points that are not finite.
+/// Raises ValueError for a matrix that is not a pose and for points that are not finite.
 ///
 /// >>> import numpy as np
 /// >>> truth = np.eye(4); truth[2, 3] = 1.0
@@ -160,7 +160,7 @@ fn projection_error(
     free(py, || sixfold::bop::projection_error(&points, e, g, &camera.0))
 }
 
-/// The angle in radians between two rotations, under the symmetry (S, 4, 4) for which it is smallest.
+/// Angle in radians between two rotations, under the symmetry (S, 4, 4) for which it is smallest; by default the identity only.
 ///
 /// >>> import numpy as np
 /// >>> rotation_error(np.diag([-1.0, -1.0, 1.0, 1.0]), np.eye(4))
@@ -176,7 +176,7 @@ fn rotation_error(
     Ok(sixfold::bop::rotation_error(&e, &g, &self::symmetries(symmetries)?))
 }
 
-/// The distance in metres between two origins, under the symmetry (S, 4, 4) for which it is smallest.
+/// Distance in metres between two origins, under the symmetry (S, 4, 4) for which it is smallest; by default the identity only.
 ///
 /// >>> import numpy as np
 /// >>> moved = np.eye(4); moved[2, 3] = 0.5
@@ -214,13 +214,13 @@ fn vsd_options(taus: Option<&Bound<'_, PyAny>>, delta: f64) -> PyResult<VsdOptio
     Ok(options)
 }
 
-/// Visible surface discrepancy (Hodan et al. 2018, equation 1; step cost, visibility "bop19"), 0 to 1, one number a tau.
+/// Visible surface discrepancy (VSD; Hodan et al. 2018, equation 1; step cost, visibility "bop19"), 0 to 1, one number per tau.
 ///
-/// mesh is rendered at estimate and ground_truth (4, 4); depth (H, W) metres is what the sensor saw, 0 where nothing. taus:
-/// misalignment tolerances as fractions of the diameter (default .05 to .5); delta: tolerance of the visibility test in
-/// metres. diameter: default that of the mesh.
+/// mesh is rendered at estimate and ground_truth (4, 4); depth (H, W) in metres is the sensor's depth image, 0 where nothing was
+/// measured. taus: misalignment tolerances as fractions of the diameter (default .05 to .5 in steps of .05); delta: tolerance of
+/// the visibility test, metres; diameter: metres, by default that of the mesh.
 ///
-/// Raises ValueError when depth and camera differ in size or the mesh has no faces.
+/// Raises ValueError when depth and camera differ in size, the mesh has no faces or the diameter is not above 0.
 ///
 /// >>> vsd(mesh, pose, ground_truth, depth, camera).mean()  # doctest: +SKIP
 #[pyfunction]
@@ -242,7 +242,7 @@ fn vsd<'py>(
     let camera = camera.of_image("depth", test.size())?;
     let mesh = mesh.get();
     if mesh.mesh.faces().is_empty() {
-        return Err(bad("mesh", "a mesh with faces to be drawn", "a list of points"));
+        return Err(bad("mesh", "a mesh with faces to render", "a list of points"));
     }
     let diameter = diameter.unwrap_or_else(|| mesh.known_diameter());
     let options = vsd_options(taus, delta)?;
@@ -253,10 +253,9 @@ fn vsd<'py>(
     Ok(PyArray1::from_vec(py, errors.map_err(vsd_error)?))
 }
 
-/// As vsd from depth images (H, W) in metres that were drawn elsewhere: of the model at the estimate, at the ground
-/// truth, and the sensor's.
+/// As vsd, from depth images (H, W) in metres: the model rendered at the estimate and at the ground truth, and the sensor's.
 ///
-/// Raises ValueError for images of different sizes, a diameter that is not above 0.
+/// Raises ValueError for images of different sizes and a diameter that is not above 0.
 ///
 /// >>> import numpy as np
 /// >>> wall = np.ones((480, 640), np.float32)
@@ -283,8 +282,9 @@ fn vsd_of_depth<'py>(
     Ok(PyArray1::from_vec(py, errors.map_err(vsd_error)?))
 }
 
-/// Average precision with COCO's 101 recall steps, as the BOP Challenge 2024 computes it: right (N,) bool says of each
-/// detection, by falling score, whether it is matched; positives is the number of ground-truth poses. None without any.
+/// Average precision with COCO's 101 recall steps, as the BOP Challenge 2024 computes it. right (N,) bool states for each
+/// detection, in order of falling score, whether it is matched; positives is the number of ground-truth poses. None without ground
+/// truth.
 ///
 /// >>> round(average_precision([True, False], 1), 6)
 /// 1.0
@@ -298,8 +298,8 @@ fn average_precision(right: Vec<bool>, positives: i64) -> PyResult<Option<f64>> 
     Ok(sixfold::bop::average_precision(&right, positives))
 }
 
-/// Area under the accuracy-threshold curve from 0 to `largest` metres, 0 to 1, as PoseCNN's toolbox computes it (Xiang et
-/// al. 2018). errors (N,) metres, infinite where an estimate is missing. None for an empty list.
+/// Area under the accuracy-threshold curve from 0 to `largest` metres, 0 to 1, as PoseCNN's toolbox computes it (Xiang et al.
+/// 2018). errors (N,) in metres, infinite where an estimate is missing. None for an empty list.
 ///
 /// >>> import numpy as np
 /// >>> area_under_accuracy([0.0, np.inf])
@@ -313,7 +313,7 @@ fn area_under_accuracy(errors: Vec<f64>, largest: f64) -> PyResult<Option<f64>> 
     Ok(sixfold::bop::area_under_accuracy(&errors, arrays::positive("largest", largest)?))
 }
 
-/// The fraction of errors (N,) below a threshold, 0 to 1; None for an empty list.
+/// Fraction of the errors (N,) that are below a threshold, 0 to 1; None for an empty list.
 ///
 /// >>> recall_below([0.01, 0.2], 0.1)
 /// 0.5
@@ -362,14 +362,15 @@ fn models_of(word: &str) -> PyResult<Models> {
     }
 }
 
-/// Scores a result file as the BOP Challenge 2019 does (Hodan et al. 2020): a dict with ar, ar_vsd, ar_mssd, ar_mspd,
-/// add_s_recall (by object id, "mean", "mean_over_objects"), add_auc, add_s_auc, objects, curves, targets, estimates; what
-/// cannot be computed is None and `reasons` says why.
+/// Scores a result file as the BOP Challenge 2019 does (Hodan et al. 2020). Returns a dict with ar, ar_vsd, ar_mssd, ar_mspd,
+/// add_s_recall (by object id, "mean", "mean_over_objects"), add_auc, add_s_auc, objects, curves, targets, estimates,
+/// estimates_left_out, average_time_per_image and reasons. A score that cannot be computed is None, and `reasons` states why.
 ///
-/// dataset: a bop.Dataset or its folder; results: a CSV file in BOP's form (millimetres in the file) or a list of
-/// bop.Estimate. targets: a targets file (default test_targets_bop19.json); vsd=False leaves VSD out, which takes longest;
-/// visib_gt_min: least visible fraction of a target in place of BOP's rule; models: "eval" or "rendering"; curves: a PNG
-/// file for recall curves. Ctrl-C is heard.
+/// dataset: a bop.Dataset, or its folder, of which `split` is scored. results: a CSV file in BOP's format (millimetres) or a list
+/// of bop.Estimate. targets: a targets file (by default the dataset's test_targets_bop19.json, or without one every pose of the
+/// split that is at least 10 % visible). vsd=False leaves out VSD, which takes longest; its visibility tolerance is 15 mm for every
+/// dataset (BOP: 5 mm for ITODD). visib_gt_min: minimum visible fraction of a target, instead of BOP's rule. models: "eval" or
+/// "rendering". curves: a PNG file to write, with the recall curves. Ctrl-C interrupts it.
 ///
 /// Raises OSError for files that cannot be read, ValueError for broken ones.
 ///
@@ -409,10 +410,8 @@ fn bop19<'py>(
     json_to_python(py, &scores)
 }
 
-/// Scores estimates as 6D detections (BOP Challenge 2024): a dict with ap, ap_mssd, ap_mspd, ap_mssd_mm (thresholds 2 to
-/// 20 mm), objects, reasons. Arguments as for bop19.
-///
-/// Raises as bop19.
+/// Scores estimates as 6D detections (BOP Challenge 2024). Returns a dict with ap, ap_mssd, ap_mspd, ap_mssd_mm (MSSD thresholds 2
+/// to 20 mm), objects and reasons. Arguments and exceptions as for bop19.
 ///
 /// >>> bop24("data/demo", "out/results.csv")["ap"]  # doctest: +SKIP
 #[pyfunction]

@@ -1,5 +1,5 @@
-//! `Templates`, `Mttm` and `estimate_mttm`: objects found in depth by templates, with or without a mesh, nothing trained for
-//! them (`sixfold-mttm`).
+//! `Templates`, `Mttm` and `estimate_mttm`: find objects in depth images by templates, with or without a mesh, and without training
+//! on them (`sixfold-mttm`).
 
 use std::path::PathBuf;
 use std::sync::{Arc, OnceLock};
@@ -35,7 +35,7 @@ fn file_error(error: StoreError) -> PyErr {
     }
 }
 
-/// What an object looks like in depth from many sides: patches of a fixed metric size. Made by `from_mesh`, `from_depth` or
+/// Templates of an object: its depth from many sides, as patches of a fixed metric size. Created by `from_mesh`, `from_depth` or
 /// `load`; nothing is trained.
 ///
 /// >>> cube = Mesh([[x, y, z] for x in (0, .06) for y in (0, .08) for z in (0, .1)]).convex_hull()
@@ -45,7 +45,7 @@ fn file_error(error: StoreError) -> PyErr {
 #[pyclass(name = "Templates", module = "sixfold", frozen)]
 pub(crate) struct PyTemplates(Arc<ObjectTemplates>);
 
-/// A view as it was handed in.
+/// A view as given.
 struct View {
     depth: DepthImage,
     camera: Camera,
@@ -55,12 +55,12 @@ struct View {
 
 #[pymethods]
 impl PyTemplates {
-    /// Draws a mesh from all sides.
+    /// Renders templates of a mesh from many directions.
     ///
-    /// coverage: "above" for what stands on a table, its z axis up, seen by a camera held upright within 45 degrees (305
-    /// views); "around" for all directions and any rotation of the camera (642 views). Ctrl-C is heard.
+    /// coverage: "above" for objects that stand on a table with their z axis up, seen from above by a camera held upright within 45
+    /// degrees (305 views); "around" for all directions and any roll of the camera (642 views). Ctrl-C interrupts it.
     ///
-    /// Raises ValueError for a mesh without faces, another coverage.
+    /// Raises ValueError for a mesh without faces and another coverage.
     #[staticmethod]
     #[pyo3(signature = (mesh, *, coverage="above"))]
     fn from_mesh(py: Python<'_>, mesh: &Bound<'_, PyMesh>, coverage: &str) -> PyResult<Self> {
@@ -71,17 +71,18 @@ impl PyTemplates {
         made.map(|t| PyTemplates(Arc::new(t))).map_err(|error| template_error("mesh", &error))
     }
 
-    /// Cuts an object without a mesh out of depth images; one view is enough to look for it.
+    /// Cuts templates of an object without a mesh out of depth images; one view is enough to search for it.
     ///
-    /// views: tuples (depth, camera, mask) or (depth, camera, mask, camera_from_object), the same kind for all: depth (H, W)
-    /// metres, without lens distortion; mask (H, W) bool; pose (4, 4). Without poses every view has a frame of its own,
-    /// parallel to its camera, the origin in the middle of what is seen, and poses found with it are that frame's.
+    /// views: tuples (depth, camera, mask) or (depth, camera, mask, camera_from_object), the same form for all: depth (H, W) in
+    /// metres, without lens distortion; mask (H, W) bool; pose (4, 4). Without poses every view has an object frame of its own:
+    /// parallel to its view frame, with the origin at the centroid of the visible points. Poses found with the view are those of
+    /// this frame.
     ///
-    /// check_masks: leave out of the masks what depth shows to be something else, the table around the object and what lies beyond
-    /// depth edges; warns from 3 % of a mask on.
+    /// check_masks: leaves out the pixels of the masks that, by their depth, do not show the object: those on the table around it
+    /// and on surfaces beyond a depth edge. Warns from 3 % of a mask on.
     ///
-    /// Raises ValueError for no view, a mask of another size or with too little depth, one more than a third of which is something else, an object smaller than 1.5 cm or
-    /// larger than 60 cm, poses for some views only.
+    /// Raises ValueError for no view; a mask of another size, with too little depth or, with check_masks, of which more than a
+    /// third would be left out; an object smaller than 1.5 cm or larger than 60 cm; poses for some views only.
     #[staticmethod]
     #[pyo3(signature = (views, *, check_masks=true))]
     fn from_depth(py: Python<'_>, views: Vec<Bound<'_, PyAny>>, check_masks: bool) -> PyResult<Self> {
@@ -104,7 +105,7 @@ impl PyTemplates {
         made.map(|t| PyTemplates(Arc::new(t))).map_err(|error| template_error("views", &error))
     }
 
-    /// Reads a file that `save` or `sixfold object add` wrote.
+    /// Reads a file written by `save` or `sixfold object add`.
     ///
     /// Raises OSError when it cannot be read, ValueError when it is damaged or of another version.
     #[staticmethod]
@@ -113,7 +114,7 @@ impl PyTemplates {
         read.map(|t| PyTemplates(Arc::new(t))).map_err(file_error)
     }
 
-    /// Writes a file; one that was there stays until the new one is whole.
+    /// Writes a file; an existing one stays until the new one is complete.
     ///
     /// Raises OSError when it cannot be written.
     fn save(&self, py: Python<'_>, path: PathBuf) -> PyResult<()> {
@@ -121,7 +122,7 @@ impl PyTemplates {
         interruptible(py, move |_| templates.write(&path))?.map_err(file_error)
     }
 
-    /// Diameter of the object, or the largest extent seen, metres.
+    /// Diameter of the object, metres; for objects from depth images the largest visible extent.
     #[getter]
     fn diameter(&self) -> f64 {
         self.0.diameter
@@ -133,7 +134,7 @@ impl PyTemplates {
         self.0.size
     }
 
-    /// What they were made from: "mesh", "posed depth", or "depth", where every view has a frame of its own.
+    /// What the templates were made from: "mesh", "posed depth", or "depth", where every view has an object frame of its own.
     #[getter]
     fn source(&self) -> &'static str {
         match self.0.source {
@@ -143,14 +144,15 @@ impl PyTemplates {
         }
     }
 
-    /// From the object's frame to that of each view (origin at a point of the surface, z along its ray), (N, 4, 4) float64.
+    /// Transformations from the object's frame to each view frame (origin at a point of the surface, z along the ray through it),
+    /// (N, 4, 4) float64.
     #[getter]
     fn view_from_object<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray3<f64>>> {
         let poses: Vec<Pose> = self.0.templates.iter().map(|t| t.view_from_object).collect();
         arrays::from_poses(py, &poses)
     }
 
-    /// Depth relative to the view's origin, (N, 64, 64) float32, metres; NaN where the object is not seen.
+    /// Depth relative to the origin of the view frame, (N, 64, 64) float32, metres; NaN where the object is not visible.
     #[getter]
     fn patches<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray3<f32>>> {
         let relative = self.0.templates.iter().flat_map(|t| {
@@ -173,7 +175,7 @@ impl PyTemplates {
     }
 }
 
-/// The views with what depth shows to be something else left out of their masks.
+/// The views with their masks reduced to the pixels that, by their depth, show the object; warns where much is left out.
 fn checked(py: Python<'_>, views: Vec<View>) -> PyResult<Vec<View>> {
     let checked = interruptible(py, move |_| {
         let checked = views.into_iter().map(|view| (check_mask(&view.depth, &view.camera, &view.mask), view));
@@ -212,7 +214,7 @@ fn view_of(number: usize, view: &Bound<'_, PyAny>) -> PyResult<View> {
     let depth = arrays::depth(&format!("{name}: depth"), &parts.get_item(0)?)?;
     let camera = parts.get_item(1)?;
     let camera: PyCamera =
-        camera.extract().map_err(|_| wrong(format!("{} in place of the camera", camera.get_type())))?;
+        camera.extract().map_err(|_| wrong(format!("{} instead of the camera", camera.get_type())))?;
     let camera = camera.of_image("views", depth.size())?;
     let mask = arrays::mask(&format!("{name}: mask"), &parts.get_item(2)?)?;
     let pose = match parts.len() {
@@ -222,7 +224,7 @@ fn view_of(number: usize, view: &Bound<'_, PyAny>) -> PyResult<View> {
     Ok(View { depth, camera, mask, pose })
 }
 
-/// From which sides templates are rendered, by its name.
+/// The directions from which templates are rendered, by name.
 pub(crate) fn coverage(argument: &str, name: &str) -> PyResult<ViewCoverage> {
     let known = [ViewCoverage::Above, ViewCoverage::Around];
     known.into_iter().find(|c| c.name() == name).ok_or_else(|| {
@@ -230,11 +232,11 @@ pub(crate) fn coverage(argument: &str, name: &str) -> PyResult<ViewCoverage> {
     })
 }
 
-/// Who matches regions with templates, as it is typed.
+/// How regions are matched with templates, by name.
 const MATCHERS: [(&str, MatchedBy); 3] =
     [("points", MatchedBy::Points), ("network", MatchedBy::Network), ("both", MatchedBy::Both)];
 
-/// Who matches, by its name.
+/// How regions are matched, by name.
 pub(crate) fn matched_by(matcher: &str) -> PyResult<MatchedBy> {
     let known = MATCHERS.into_iter().find(|(name, _)| *name == matcher);
     known.map(|(_, by)| by).ok_or_else(|| {
@@ -242,7 +244,7 @@ pub(crate) fn matched_by(matcher: &str) -> PyResult<MatchedBy> {
     })
 }
 
-/// The network within the package, read once, or that of a file.
+/// The network in the package, read once, or that of a file.
 pub(crate) fn network(weights: Option<PathBuf>) -> Result<Arc<MttmModel>, ModelError> {
     static SHIPPED: OnceLock<Arc<MttmModel>> = OnceLock::new();
     match (weights, SHIPPED.get()) {
@@ -255,17 +257,17 @@ pub(crate) fn network(weights: Option<PathBuf>) -> Result<Arc<MttmModel>, ModelE
     }
 }
 
-/// An object ready to be looked for by its templates (dissertation, chapter 5). Prepared once, used for any number of images.
+/// An object prepared for the search by templates (dissertation, chapter 5). Prepared once, used for any number of images.
 ///
-/// templates: Templates, or a Mesh, whose templates from above are made first. mesh: a Mesh or PpfModel of the object, with
-/// which poses are refined and verified; without it (and with Templates) the templates alone decide. matcher: who matches
-/// regions of the image with templates: "points" compares them point by point, "network" by a network's descriptors alone
-/// (as the dissertation does), "both" by both. The network was trained on synthetic objects and comes with the package;
-/// weights: another one, a file that `train_mttm` or `sixfold train mttm` wrote. With `cache`, a file, its descriptors of the
-/// templates are read from there when they fit network and templates, and written there otherwise.
+/// templates: Templates, or a Mesh, of which templates from above are made first. mesh: a Mesh or PpfModel of the object, with
+/// which poses are refined and verified; without it (and with Templates), only the templates are used. matcher: how regions of the
+/// image are matched with templates: "points" compares them point by point, "network" uses only a network's descriptors (as the
+/// dissertation does), "both" uses both. The built-in network was trained on synthetic objects; weights: another one, a file
+/// written by `train_mttm` or `sixfold train mttm`. cache: a file with the network's descriptors of the templates; it is read if it
+/// belongs to network and templates, otherwise computed and written.
 ///
-/// Raises ValueError for a mesh without faces, another matcher, weights or cache with matcher="points", a file that is no such
-/// network; OSError when it cannot be read. Ctrl-C is heard.
+/// Raises ValueError for a mesh without faces, another matcher, weights or cache with matcher="points", or a file that is not such
+/// a network; OSError when it cannot be read. Ctrl-C interrupts it.
 ///
 /// >>> known = Mttm(Templates.load("mug.sixfold-templates"), matcher="both")  # doctest: +SKIP
 /// >>> estimate_mttm(depth, known, camera)[0].camera_from_object  # doctest: +SKIP
@@ -273,7 +275,8 @@ pub(crate) fn network(weights: Option<PathBuf>) -> Result<Arc<MttmModel>, ModelE
 pub(crate) struct Mttm {
     known: Arc<KnownObject>,
     matched_by: MatchedBy,
-    /// Why descriptors in `cache` were not taken, or could not be written; None otherwise.
+    /// Why `cache` could not be read or written; None otherwise, also if it is new or was made for other templates or another
+    /// network.
     #[pyo3(get)]
     cache_note: Option<String>,
 }
@@ -329,7 +332,7 @@ impl Mttm {
         self.known.has_mesh()
     }
 
-    /// Who matches regions with templates: "points", "network" or "both".
+    /// How regions are matched with templates: "points", "network" or "both".
     #[getter]
     fn matcher(&self) -> &'static str {
         MATCHERS.iter().find(|(_, matched_by)| *matched_by == self.matched_by).map_or("", |(name, _)| name)
@@ -345,20 +348,20 @@ impl Mttm {
 /// A pose found by templates.
 #[pyclass(name = "MttmEstimate", module = "sixfold", frozen)]
 pub(crate) struct MttmEstimate {
-    /// The pose, (4, 4) float64, metres; with views without poses that of the matched view's own frame.
+    /// The pose, (4, 4) float64, metres; for views without poses, that of the matched view's own object frame.
     #[pyo3(get)]
     camera_from_object: Py<PyArray2<f64>>,
-    /// What decides between estimates, 0 to 1.
+    /// Confidence, 0 to 1, by which estimates are ranked.
     #[pyo3(get)]
     confidence: f64,
-    /// Number of the matched template.
+    /// Index of the matched template.
     #[pyo3(get)]
     template: usize,
-    /// Pixels of the object by the matched template, (H, W) bool.
+    /// Pixels of the object according to the matched template, (H, W) bool.
     #[pyo3(get)]
     mask: Py<PyArray2<bool>>,
-    /// By the mesh, or by the template where there is none: rendered, inliers, occluded, outliers (pixels), depth, boundary,
-    /// normals, total (0 to 1), visible_fraction.
+    /// Scores of the verification with the mesh, or with the template if there is no mesh, a dict: rendered, inliers, occluded,
+    /// outliers (pixels); depth, boundary, normals, total, visible_fraction (0 to 1).
     #[pyo3(get)]
     verification: Py<PyDict>,
 }
@@ -370,14 +373,14 @@ impl MttmEstimate {
     }
 }
 
-/// Finds an object never trained on in a depth image by its templates (dissertation, chapter 5). A list of MttmEstimate,
-/// best first, empty when nothing scores min_score.
+/// Finds an object in a depth image by its templates, without training on it (dissertation, chapter 5). Returns a list of
+/// MttmEstimate, best first; empty if none reaches a confidence of min_score.
 ///
-/// scene: a PpfScene, or depth (H, W) in metres with `camera` (and `mask` (H, W) bool of where objects may be). model: an
-/// Mttm, or Templates or a Mesh, which are prepared first (matched by "both"). instances: most poses returned. The same input gives the same
-/// result at any number of threads. Ctrl-C is heard.
+/// scene: a PpfScene, or depth (H, W) in metres with `camera` (and `mask` (H, W) bool: where objects may be). model: an Mttm, or
+/// Templates or a Mesh, which are prepared first (with matcher "both"). instances: maximum number of poses. The same input gives
+/// the same result for any number of threads. Ctrl-C interrupts it.
 ///
-/// Raises ValueError for images of different sizes, a mesh without faces, a depth in the wrong unit or without any value.
+/// Raises ValueError for images of different sizes, a mesh without faces, and a depth image in the wrong unit or without any value.
 ///
 /// >>> found = estimate_mttm(depth, Templates.from_depth([(seen, camera, mask)]), camera)  # doctest: +SKIP
 /// >>> found[0].mask.sum()  # doctest: +SKIP

@@ -1,4 +1,4 @@
-//! `Photograph`: what Neural Object Learning starts from (`sixfold-nol`).
+//! `Photograph`: the input of Neural Object Learning (`sixfold-nol`).
 
 use std::sync::Arc;
 
@@ -25,12 +25,15 @@ pub(crate) fn nol_error(error: NolError) -> PyErr {
     }
 }
 
-/// A photograph of an object with a rough pose, for refine_poses and synthesize. It cannot be changed.
+/// A photograph of an object with an approximate pose, for refine_poses and synthesize. It is immutable.
 ///
-/// rgb (H, W, 3) uint8, without lens distortion; camera_from_object (4, 4), off by a centimetre and some degrees at most;
-/// mask (H, W) bool: where the object is visible, None for all of its outline; name: what stands for it in messages.
+/// rgb: the image, (H, W, 3) uint8, without lens distortion.
+/// camera_from_object: the pose, (4, 4), with an error of at most a centimetre and some degrees.
+/// mask: where the object is visible, (H, W) bool. None: all of its outline.
+/// name: the name used in messages.
 ///
-/// Raises ValueError for images of another size than the camera's, a pose that puts the object outside the image.
+/// Raises ValueError for a camera with distortion, an image or mask of another size than the camera's, and a pose that puts the
+/// object outside the image.
 ///
 /// >>> import numpy as np
 /// >>> pose = np.eye(4)
@@ -55,7 +58,7 @@ impl PyPhotograph {
         let camera = camera.of_image("rgb", image.size())?;
         let pose = arrays::pose("camera_from_object", camera_from_object)?;
         let mask = mask.map(|mask| arrays::mask("mask", mask)).transpose()?;
-        // A photograph by a user is of one object, whatever its id in a dataset.
+        // A user's photograph shows one object; its id in a dataset does not matter.
         let photograph =
             PosedImage::new(name, 1, Arc::new(image), camera, pose).map_err(about("camera_from_object"))?;
         Ok(PyPhotograph(match mask {
@@ -64,19 +67,19 @@ impl PyPhotograph {
         }))
     }
 
-    /// What stands for it in messages.
+    /// The name used in messages.
     #[getter]
     fn name(&self) -> &str {
         self.0.name()
     }
 
-    /// Its camera.
+    /// The camera.
     #[getter]
     fn camera(&self) -> PyCamera {
         PyCamera(*self.0.camera())
     }
 
-    /// Its pose, (4, 4) float64, metres.
+    /// The pose, (4, 4) float64, metres.
     #[getter]
     fn camera_from_object<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
         arrays::from_pose(py, self.0.camera_from_object())

@@ -21,7 +21,7 @@ use crate::guard::{Leave, Tell, free, os_error, reporting};
 use crate::mesh::PyMesh;
 use crate::photograph::{PyPhotograph, nol_error};
 
-/// Side of the crops that new views take their colours from, pixels: as the command line has it.
+/// Side of the crops from which new views take their colours, pixels. The command line uses the same value.
 const CROP: usize = 256;
 
 fn model_error(error: ModelError) -> PyErr {
@@ -31,7 +31,7 @@ fn model_error(error: ModelError) -> PyErr {
     }
 }
 
-/// The poses of photographs, made better.
+/// The refined poses of photographs.
 #[pyclass(name = "RefinedPoses", module = "sixfold", frozen)]
 pub(crate) struct RefinedPoses {
     refinement: Refinement,
@@ -50,59 +50,59 @@ impl RefinedPoses {
 
 #[pymethods]
 impl RefinedPoses {
-    /// The poses, (N, 4, 4) float64, metres, in the order of the photographs; the given one where one was dropped.
+    /// The refined poses, (N, 4, 4) float64, metres, in the order of the photographs. A dropped photograph keeps its given pose.
     #[getter]
     fn camera_from_object<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray3<f64>>> {
         let poses: Vec<_> = self.refinement.sources.iter().map(|s| s.camera_from_object).collect();
         arrays::from_poses(py, &poses)
     }
 
-    /// How far the object's origin moved, (N,) float64, metres.
+    /// Distance by which the object's origin moved, (N,) float64, metres.
     #[getter]
     fn moved<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
         self.numbers(py, |s| s.moved)
     }
 
-    /// How far the object was rotated, (N,) float64, radians.
+    /// Angle by which the object was rotated, (N,) float64, radians.
     #[getter]
     fn turned<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
         self.numbers(py, |s| s.turned)
     }
 
-    /// Mean difference in colour to the other photographs before and after, (N, 2) float64, 0 to 1; NaN where there is
-    /// nothing to compare.
+    /// Mean difference in colour from the other photographs, before and after the refinement, (N, 2) float64, 0 to 1. NaN if
+    /// there is nothing to compare.
     #[getter]
     fn differences<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
         arrays::from_rows(py, self.refinement.sources.iter().map(|s| s.difference).collect())
     }
 
-    /// For each photograph why it should not be used, or None.
+    /// For each photograph, the reason why it should not be used, or None.
     #[getter]
     fn dropped(&self) -> Vec<Option<String>> {
         self.refinement.sources.iter().map(|s| s.dropped.clone()).collect()
     }
 
-    /// Whether the objects were taken to have stood still.
+    /// Whether the objects were assumed to have stood still in all photographs.
     #[getter]
     fn still(&self) -> bool {
         self.refinement.still
     }
 
-    /// At how many places the objects stood: as many as objects where nothing moved, or nothing is known of it; more where some
-    /// were moved between some of the photographs.
+    /// Number of places at which the objects stood. It is the number of objects if nothing moved or if this is unknown, and
+    /// larger if some objects were moved between some of the photographs.
     #[getter]
     fn places(&self) -> usize {
         self.refinement.places
     }
 
-    /// How far the given poses are from one common arrangement, 1 for what their roughness explains; None where there is
-    /// nothing to compare.
+    /// Disagreement of the given poses with one common arrangement, relative to the disagreement that their standard deviation
+    /// (rough) explains: 1 is as expected. None if there is nothing to compare.
     #[getter]
     fn disagreement(&self) -> Option<f64> {
         self.refinement.disagreement
     }
 
-    /// The photographs that are not dropped, with their new poses: a list of Photograph.
+    /// The photographs that were not dropped, with their refined poses: a list of Photograph.
     #[getter]
     fn photographs(&self) -> PyResult<Vec<PyPhotograph>> {
         let kept = self.photographs.iter().zip(&self.refinement.sources).filter(|(_, s)| s.dropped.is_none());
@@ -129,7 +129,7 @@ enum Meshes<'py> {
     Several(Vec<Bound<'py, PyMesh>>),
 }
 
-/// A whole number for every photograph, or the given default.
+/// One whole number per photograph, or the default.
 fn numbering(
     argument: &str,
     given: Option<&Bound<'_, PyAny>>,
@@ -139,21 +139,28 @@ fn numbering(
     let Some(given) = given else { return Ok((0..count).map(default).collect()) };
     let ids = arrays::ids(argument, given)?;
     if ids.len() != count {
-        return Err(bad(argument, format!("{count} numbers, one a photograph"), ids.len().to_string()));
+        return Err(bad(argument, format!("{count} numbers, one per photograph"), ids.len().to_string()));
     }
     Ok(ids.into_iter().map(|id| id as usize).collect())
 }
 
-/// Makes rough poses of photographs better by what the photographs show of the object together: robust Gauss-Newton over
-/// the differences in colour and the outline (after the dissertation, section 4.2.3).
+/// Refines approximate poses of photographs by comparing what the photographs show of the object.
 ///
-/// mesh: the object, or a list of meshes; then objects (N,) says for each photograph which one it shows. images (N,): equal
-/// numbers for photographs cut out of the same image, whose objects share its camera. scene: "still" where only the camera
-/// moved, "moving" where objects may have, "judge" to decide it by the poses. rough: standard deviation of the given poses,
-/// metres and radians. shared: rounds at each resolution in which the error that all poses of an object share is looked for,
-/// for evenly painted objects under even light. progress: called with the fraction that is done. Ctrl-C is heard.
+/// The method is robust Gauss-Newton over the differences in colour and the outline (after the dissertation, section 4.2.3).
 ///
-/// Raises ValueError for no photograph, options out of range, a mesh that reaches behind a camera.
+/// mesh: the object, or a list of meshes. With a list, objects (N,) gives the index of the mesh that each photograph shows.
+/// images (N,): equal numbers for photographs cut out of the same image. Their objects share its camera.
+/// scene: "still" if only the camera moved, "moving" if objects may have moved, "judge" to decide from the poses.
+/// rough: standard deviations of the given poses, metres and radians.
+/// shared: number of rounds at each resolution that search for the error common to all poses of an object. For uniformly painted
+///     objects under uniform light.
+/// progress: called with the completed fraction, 0 to 1.
+/// seed: seed of the surface points that are compared.
+///
+/// Ctrl-C interrupts it.
+///
+/// Raises ValueError if there is no photograph, for options out of range, a mesh without faces, a mesh that extends behind a
+/// camera, and a mask that does not show the object.
 ///
 /// >>> better = refine_poses(mesh, photographs)  # doctest: +SKIP
 /// >>> views = synthesize(mesh, better.photographs, poses, camera)  # doctest: +SKIP
@@ -235,22 +242,22 @@ fn given(photographs: &[PyRef<'_, PyPhotograph>]) -> PyResult<Vec<PosedImage>> {
     Ok(photographs.iter().map(|p| p.0.clone()).collect())
 }
 
-/// A new view of an object.
+/// A synthesized view of an object.
 #[pyclass(name = "SynthesizedView", module = "sixfold", frozen)]
 pub(crate) struct SynthesizedView {
-    /// Colours, (H, W, 3) uint8; black beside the object.
+    /// Colours, (H, W, 3) uint8; black outside the object.
     #[pyo3(get)]
     rgb: Py<PyArray3<u8>>,
     /// Where the object is, (H, W) bool.
     #[pyo3(get)]
     mask: Py<PyArray2<bool>>,
-    /// Where the object is but no photograph shows it, (H, W) bool: filled from what is near.
+    /// Where the object is but no photograph shows it, (H, W) bool. These pixels are filled from nearby ones.
     #[pyo3(get)]
     unseen: Py<PyArray2<bool>>,
     /// Fraction of the object's pixels that no photograph shows, 0 to 1.
     #[pyo3(get)]
     unseen_fraction: f64,
-    /// Numbers of the photographs that were used.
+    /// Indices of the photographs that were used.
     #[pyo3(get)]
     sources: Vec<usize>,
 }
@@ -274,17 +281,24 @@ impl SynthesizedView {
     }
 }
 
-/// Renders an object at new poses from photographs of it (Neural Object Learning; dissertation, chapter 4): a list of
-/// SynthesizedView, one a pose.
+/// Renders an object at new poses from photographs of it (Neural Object Learning; dissertation, chapter 4).
 ///
-/// photographs: as refine_poses leaves them; poses (N, 4, 4) camera_from_object, metres; camera: that of the new views.
-/// weighting: how colours of several photographs become one: "network", "average", or "best" for the one that looks at the
-/// place most directly; weights: a file that `train_nol` wrote, in place of the network that comes along; per_view: most
-/// photographs in a view; leave_out=False keeps what other photographs do not agree with. progress: called with the number
-/// of views that are done and their total. Ctrl-C is heard.
+/// Returns a list of SynthesizedView, one per pose.
 ///
-/// Raises ValueError for photographs that show nothing of the object, no photograph, another weighting; OSError when the
-/// weights cannot be read.
+/// photographs: for example those of the result of refine_poses.
+/// poses: camera_from_object of the new views, (N, 4, 4), metres.
+/// camera: the camera of the new views.
+/// weighting: how the colours of several photographs at one point are combined: "network", "average", or "best" for the
+///     photograph with the most frontal view of the point.
+/// weights: a file that `train_nol` wrote, instead of the built-in network.
+/// per_view: maximum number of photographs used for a view.
+/// leave_out: leave out pixels that do not agree with the other photographs.
+/// progress: called with the number of completed views and their total.
+///
+/// Ctrl-C interrupts it.
+///
+/// Raises ValueError if there is no photograph, for a photograph that does not show the object, a mesh without faces, a mesh that
+/// extends behind a camera, and an unknown weighting; OSError if the weights cannot be read.
 ///
 /// >>> [view] = synthesize(mesh, photographs, [pose], camera, weighting="best")  # doctest: +SKIP
 /// >>> view.rgb.shape  # doctest: +SKIP

@@ -1,4 +1,4 @@
-//! `Pix2Pose`: poses from colour with a trained network (dissertation, chapter 3).
+//! `Pix2Pose`: poses from colour images with a trained network (dissertation, chapter 3).
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -35,37 +35,40 @@ pub(crate) fn model_error(error: ModelError) -> PyErr {
 /// The pose of one object in one box.
 #[pyclass(name = "Pix2PosePose", module = "sixfold", frozen)]
 pub(crate) struct Pix2PosePose {
-    /// The object.
+    /// The id of the object.
     #[pyo3(get)]
     object_id: u32,
-    /// The pose, (4, 4) float64, metres; after alignment of the outline and with depth, where asked for.
+    /// The pose, (4, 4) float64, metres. It includes the alignment of the outline, the refinement and the alignment with depth
+    /// where they were done.
     #[pyo3(get)]
     camera_from_object: Py<PyArray2<f64>>,
-    /// Correspondences that fit over the object's pixels, 0 to 1.
+    /// Number of correspondences that fit the pose divided by the number of the object's pixels, 0 to 1.
     #[pyo3(get)]
     score: f64,
     /// Whether enough of the mesh's outline was found in the image to align it.
     #[pyo3(get)]
     refined: bool,
-    /// Agreement of the image with the refined pose, 0 to 1; None without a mesh, or if the image does not show the object there.
+    /// Agreement of the image with the refined pose, 0 to 1. None without a mesh, with depth, with refine=False, or if the image
+    /// does not show the object there.
     #[pyo3(get)]
     agreement: Option<f64>,
     /// Whether the pose was aligned with depth.
     #[pyo3(get)]
     aligned_to_depth: bool,
-    /// As PnP left them, best first: dicts with camera_from_object (4, 4), score, inliers, threshold.
+    /// The poses from PnP, best first: dicts with camera_from_object (4, 4), score, inliers, threshold.
     #[pyo3(get)]
     hypotheses: Py<PyList>,
-    /// The square of the image that the last pass saw, (4,): x, y, width, height in pixels.
+    /// The square of the image that was the input of the last pass, (4,): x, y, width, height in pixels.
     #[pyo3(get)]
     window: Py<PyArray1<f64>>,
-    /// What the network saw, (side, side, 3) uint8.
+    /// The network's input, (input side, input side, 3) uint8.
     #[pyo3(get)]
     input: Py<PyArray3<u8>>,
-    /// Object coordinates it predicts, (side, side, 3) float32, normalised to -1 to 1 over the object's box.
+    /// The predicted object coordinates, (side, side, 3) float32, normalised to -1 to 1 over the object's box. side is that of
+    /// the network's output, which may be smaller than its input.
     #[pyo3(get)]
     coordinates: Py<PyArray3<f32>>,
-    /// Their expected error, (side, side) float32, 0 to 1.
+    /// The expected error of the coordinates, (side, side) float32, 0 to 1.
     #[pyo3(get)]
     error: Py<PyArray2<f32>>,
     /// Probability that the object is visible, (side, side) float32.
@@ -74,7 +77,7 @@ pub(crate) struct Pix2PosePose {
     /// The correspondences of the best hypothesis: points (N, 3) in the object's frame, metres.
     #[pyo3(get)]
     object_points: Py<PyArray2<f64>>,
-    /// Their pixels, (N, 2).
+    /// The pixels of these correspondences, (N, 2).
     #[pyo3(get)]
     image_points: Py<PyArray2<f64>>,
 }
@@ -86,7 +89,7 @@ impl Pix2PosePose {
     }
 }
 
-/// What a call found in one box, before it becomes Python's.
+/// The result for one box, before its conversion to Python.
 struct Posed {
     object_id: u32,
     pose: estimator::Pix2PosePose,
@@ -127,7 +130,8 @@ impl Posed {
     }
 }
 
-/// A trained Pix2Pose network: poses of known objects from colour, in given boxes (Park et al. 2019). Made by `load`.
+/// A trained Pix2Pose network: estimates poses of known objects in given boxes of colour images (Park et al. 2019). Create it
+/// with `load`.
 ///
 /// >>> pix2pose = Pix2Pose.load("weights/pix2pose-lmo.safetensors", camera=camera)  # doctest: +SKIP
 /// >>> poses = pix2pose(rgb, [[330, 120, 110, 150]], object_ids=[8])  # doctest: +SKIP
@@ -138,7 +142,7 @@ pub(crate) struct Pix2Pose {
     meshes: Meshes,
 }
 
-/// Objects by their ids, and the mesh of each.
+/// Objects and their meshes by object id.
 type Meshes = BTreeMap<u32, (Arc<Pix2PoseObject>, Arc<Mesh>)>;
 
 fn meshes_of(estimator: &Pix2PoseEstimator, meshes: Option<BTreeMap<u32, Py<PyMesh>>>) -> PyResult<Meshes> {
@@ -156,10 +160,11 @@ fn meshes_of(estimator: &Pix2PoseEstimator, meshes: Option<BTreeMap<u32, Py<PyMe
 impl Pix2Pose {
     /// Reads a weight file (.safetensors) that `train_pix2pose` or `sixfold train pix2pose` wrote.
     ///
-    /// camera: the camera of the images, unless every call names its own; meshes {object id: Mesh}: with an object's mesh
-    /// its outline is aligned with the image, and its pose refined, as the last steps.
+    /// camera: the camera of the images, if calls do not give one.
+    /// meshes: {object id: Mesh}. If an object's mesh is given, its outline is aligned with the image and its pose refined, as
+    ///     the last steps.
     ///
-    /// Raises OSError when the file cannot be read, ValueError when it is no such model or a mesh is not that of its object.
+    /// Raises OSError if the file cannot be read; ValueError if it is not such a model, or if a mesh is not that of its object.
     #[classmethod]
     #[pyo3(signature = (path, camera=None, meshes=None))]
     fn load(
@@ -177,31 +182,41 @@ impl Pix2Pose {
         Ok(Pix2Pose { estimator, camera, meshes })
     }
 
-    /// What the model knows: a list of dicts with id, diameter (metres), centre and half_size (3,) of its coordinates in
-    /// metres, thresholds.
+    /// The objects of the model: a list of dicts with id, diameter (metres), centre and half_size (3,) of its coordinates in
+    /// metres, thresholds, and correction (the systematic error of aligned poses).
     #[getter]
     fn objects<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         crate::bop::json_to_python(py, &self.estimator.model.objects())
     }
 
-    /// The model's card: what it was trained on, how, with which scores.
+    /// The model's card: its training data, training options and scores.
     #[getter]
     fn card<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         crate::bop::json_to_python(py, self.estimator.model.card())
     }
 
-    /// Looks for one object in every box of an image: a list with a Pix2PosePose for each box, None where it is not seen.
+    /// Searches for one object in every box of an image: a list with a Pix2PosePose for each box, or None if the object is not
+    /// visible.
     ///
-    /// rgb (H, W, 3) uint8, without lens distortion; boxes (N, 4) x, y, width, height in pixels; object_ids (N,), not
-    /// needed for a model of one object; camera, meshes: in place of those of `load`; depth (H, W) metres: poses of
-    /// objects with a mesh are aligned with it; thresholds on the expected error in place of the model's; two_stages=False
-    /// takes the poses of the first pass; refine=False leaves the outline alone; looks: most looks at an object with a
-    /// mesh, each but the first into the box of the pose before, which helps where boxes are poor; correct=False keeps what
-    /// aligned poses were off by on the photographs of the training. The same input and seed give the same result. Ctrl-C
-    /// is heard.
+    /// rgb: the image, (H, W, 3) uint8, without lens distortion.
+    /// boxes: (N, 4), x, y, width, height in pixels.
+    /// object_ids: (N,). Not needed for a model of one object.
+    /// camera, meshes: instead of those of `load`.
+    /// depth: (H, W), metres. Poses of objects with a mesh are aligned with it, instead of refined by the network that refines
+    ///     poses.
+    /// thresholds: thresholds on the expected error, instead of the model's.
+    /// two_stages: False uses the poses of the first pass.
+    /// refine: False skips the alignment of the outline and the refinement.
+    /// looks: maximum number of passes over an object with a mesh. Each pass after the first uses the box of the previous pose.
+    ///     This helps with inaccurate boxes.
+    /// correct: False skips the correction of aligned poses by the model's systematic error, which was measured on the training
+    ///     photographs.
+    /// crop_factor: ratio of the crop's side to the longer side of the box.
+    ///
+    /// The same input and seed give the same result. Ctrl-C interrupts it.
     ///
     /// Raises ValueError for an unknown object, a box without area or outside the image, an image of another size than the
-    /// camera's.
+    /// camera's, and depth without meshes.
     #[pyo3(signature = (rgb, boxes, object_ids=None, *, camera=None, meshes=None, depth=None, thresholds=None, two_stages=true, refine=true, looks=1, correct=true, crop_factor=1.5, seed=0))]
     #[allow(clippy::too_many_arguments)]
     fn __call__(
@@ -232,13 +247,13 @@ impl Pix2Pose {
                 [only] => vec![only.id; boxes.len()],
                 several => {
                     let known: Vec<String> = several.iter().map(|o| o.id.to_string()).collect();
-                    let expected = format!("one id a box out of {}", known.join(", "));
+                    let expected = format!("one id per box out of {}", known.join(", "));
                     return Err(bad("object_ids", expected, "None"));
                 }
             },
         };
         if ids.len() != boxes.len() {
-            return Err(bad("object_ids", format!("{} ids, one a box", boxes.len()), ids.len().to_string()));
+            return Err(bad("object_ids", format!("{} ids, 1 per box", boxes.len()), ids.len().to_string()));
         }
         let mut objects = BTreeMap::new();
         for id in &ids {
@@ -297,7 +312,7 @@ impl Pix2Pose {
                 if let (Some((_, mesh)), Some(depth)) = (meshes.get(&object_id), &prepared) {
                     let diameter = estimator.model.object(object_id).map(|(_, o)| o.diameter)?;
                     let start = pose.camera_from_object;
-                    // Too little depth on the object leaves the pose that colour gave.
+                    // With too little depth on the object, the pose from colour is kept.
                     if let Ok(to_depth) = align(depth, mesh, diameter, &start, &pose.found, None) {
                         pose.camera_from_object = to_depth.camera_from_object;
                         aligned = true;

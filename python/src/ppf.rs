@@ -1,4 +1,4 @@
-//! Poses from depth without training: point pair features (`estimate_ppf`).
+//! Poses from depth images without training: point pair features (`estimate_ppf`).
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -17,23 +17,26 @@ use crate::guard::interruptible;
 use crate::mesh::PyMesh;
 use crate::scene::PyPlane;
 
-/// Step of discretised symmetry axes in a description, as a fraction of the diameter: as the command line does.
+/// Step at which continuous symmetries are discretised in a description, as a fraction of the diameter. The command line uses
+/// the same value.
 const SYMMETRY_STEP: f64 = 0.05;
 
-/// An object ready to be matched in depth images by point pair features (Drost et al. 2010). Made once a mesh, used for
-/// any number of images.
+/// An object prepared for matching in depth images by point pair features (Drost et al. 2010). Create it once per mesh and use
+/// it for any number of images.
 ///
-/// sampling_step: distance between samples as a fraction of the diameter; angle_steps: steps of each angle over half a turn.
-/// With `cache`, a file, the description is read from there when it fits mesh and options, and written there otherwise.
-/// Symmetries are those of the mesh.
+/// sampling_step: distance between samples as a fraction of the diameter.
+/// angle_steps: number of steps of each angle from 0 to 180 degrees.
+/// cache: a file. The description is read from it if it fits the mesh and options; otherwise it is computed and written there.
 ///
-/// Raises ValueError for a mesh without faces or options out of range. Ctrl-C is heard.
+/// The symmetries are those of the mesh. Ctrl-C interrupts it.
+///
+/// Raises ValueError for a mesh without faces and options out of range.
 ///
 /// >>> model = PpfModel(Mesh.load("data/demo/models/obj_000008.ply", "mm"))  # doctest: +SKIP
 #[pyclass(name = "PpfModel", module = "sixfold", frozen)]
 pub(crate) struct PpfModel {
     pub(crate) model: Arc<ObjectModel>,
-    /// Why a description in `cache` was not taken, or could not be written; None otherwise.
+    /// Why the description in `cache` was not used or could not be written; None otherwise.
     #[pyo3(get)]
     cache_note: Option<String>,
 }
@@ -75,13 +78,13 @@ impl PpfModel {
         self.model.diameter()
     }
 
-    /// The surface samples the features are made of, (N, 3) in the object's frame, metres.
+    /// The surface samples from which the features are computed, (N, 3) in the object's frame, metres.
     #[getter]
     fn samples<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
         arrays::from_points3(py, &self.model.samples().points)
     }
 
-    /// Point pairs in the feature table.
+    /// Number of point pairs in the feature table.
     #[getter]
     fn pair_count(&self) -> usize {
         self.model.pair_count()
@@ -92,7 +95,7 @@ impl PpfModel {
     }
 }
 
-/// A depth image or a mask that cannot be searched.
+/// The error for a depth image or a mask that cannot be searched.
 pub(crate) fn depth_error(error: PreparedDepthError) -> PyErr {
     match &error {
         PreparedDepthError::MaskSize { .. } => about("mask")(error),
@@ -100,13 +103,18 @@ pub(crate) fn depth_error(error: PreparedDepthError) -> PyErr {
     }
 }
 
-/// A depth image prepared for estimate_ppf: in-painting, normals, table plane, thinned points. Prepare once, search any
-/// number of objects.
+/// A depth image prepared for estimate_ppf: in-painting, normals, table plane, downsampled points. Prepare it once and search it
+/// for any number of objects.
 ///
-/// depth (H, W) metres; mask (H, W) bool says where objects may be; remove_plane leaves the dominant plane out;
-/// max_depth in metres.
+/// depth: (H, W), metres.
+/// mask: where objects may be, (H, W) bool.
+/// remove_plane: leave out the points of the dominant plane.
+/// max_depth: points further away are left out, metres.
+/// seed: seed of the search for the plane.
 ///
-/// Raises ValueError for images of different sizes, a depth in the wrong unit or without any value. Ctrl-C is heard.
+/// Ctrl-C interrupts it.
+///
+/// Raises ValueError for images of different sizes, and depth in the wrong unit or without any value.
 ///
 /// >>> scene = PpfScene(depth, camera)  # doctest: +SKIP
 #[pyclass(name = "PpfScene", module = "sixfold", frozen)]
@@ -136,13 +144,13 @@ impl PpfScene {
         Ok(PpfScene(Arc::new(scene)))
     }
 
-    /// The table plane, normal to the camera, or None.
+    /// The table plane, its normal towards the camera, or None.
     #[getter]
     fn plane(&self) -> Option<PyPlane> {
         self.0.plane().map(|p| PyPlane(*p))
     }
 
-    /// The points that are matched, (N, 3) in the camera frame, metres: off the plane and inside the mask.
+    /// The points that are matched, (N, 3) in the camera frame, metres: inside the mask and not on the plane.
     #[getter]
     fn points<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
         arrays::from_points3(py, &self.0.cloud().points)
@@ -155,14 +163,14 @@ pub(crate) struct PpfEstimate {
     /// The pose, (4, 4) float64, metres.
     #[pyo3(get)]
     camera_from_object: Py<PyArray2<f64>>,
-    /// What decides between estimates, 0 to 1.
+    /// The score by which estimates are ranked, 0 to 1.
     #[pyo3(get)]
     confidence: f64,
-    /// Votes of the hypothesis it came from.
+    /// Votes of the hypothesis from which the pose was refined.
     #[pyo3(get)]
     votes: f32,
-    /// The verification by rendering (dissertation, section 5.2.5): rendered, inliers, occluded, outliers (pixels), depth,
-    /// boundary, normals, total (0 to 1), visible_fraction.
+    /// The scores of the verification by rendering (dissertation, section 5.2.5). Numbers of pixels: rendered, inliers,
+    /// occluded, outliers. From 0 to 1: depth, boundary, normals, total, visible_fraction.
     #[pyo3(get)]
     verification: Py<PyDict>,
 }
@@ -180,14 +188,22 @@ enum ModelOrMesh<'py> {
     Mesh(Bound<'py, PyMesh>),
 }
 
-/// Finds an object in a depth image by point pair features, verified by rendering; no training (Drost et al. 2010;
-/// Hinterstoisser et al. 2016; Vidal et al. 2018). A list of PpfEstimate, best first, empty when nothing scores min_score.
+/// Searches for an object in a depth image by point pair features with verification by rendering, without training (Drost et al.
+/// 2010; Hinterstoisser et al. 2016; Vidal et al. 2018).
 ///
-/// scene: a PpfScene, or depth (H, W) in metres with `camera` (and `mask` (H, W) bool). model: a PpfModel or a Mesh,
-/// which is described first. instances: most poses returned; refined and verified: hypotheses that get a short ICP and
-/// the full check. The same input gives the same result at any number of threads. Ctrl-C is heard.
+/// Returns a list of PpfEstimate, best first; empty if no confidence reaches min_score.
 ///
-/// Raises ValueError for images of different sizes, a mesh without faces, a depth in the wrong unit or without any value.
+/// scene: a PpfScene, or depth (H, W) in metres with `camera` (and `mask` (H, W) bool).
+/// model: a PpfModel, or a Mesh, from which a PpfModel is made first.
+/// instances: maximum number of poses returned.
+/// min_score: poses with a lower confidence are left out, 0 to 1.
+/// refined: number of hypotheses that get a short ICP.
+/// verified: number of hypotheses that get a full ICP and are verified by rendering.
+/// seed: seed of the search for the plane.
+///
+/// The same input gives the same result at any number of threads. Ctrl-C interrupts it.
+///
+/// Raises ValueError for images of different sizes, a mesh without faces, and depth in the wrong unit or without any value.
 ///
 /// >>> found = estimate_ppf(depth, mesh, camera)  # doctest: +SKIP
 /// >>> found[0].camera_from_object  # doctest: +SKIP
@@ -230,7 +246,7 @@ pub(crate) fn estimate_ppf(
         .collect()
 }
 
-/// A PpfScene, or a depth image prepared as one.
+/// A PpfScene as it is, or a depth image prepared as one.
 pub(crate) fn scene_of(
     py: Python<'_>,
     scene: &Bound<'_, PyAny>,
@@ -241,7 +257,7 @@ pub(crate) fn scene_of(
     match scene.cast::<PpfScene>() {
         Ok(scene) => {
             if camera.is_some() || mask.is_some() {
-                return Err(bad("camera", "none beside a PpfScene, which has its own", "camera or mask"));
+                return Err(bad("camera", "none with a PpfScene, which has its own", "camera or mask"));
             }
             Ok(scene.get().0.clone())
         }
@@ -252,7 +268,7 @@ pub(crate) fn scene_of(
     }
 }
 
-/// A PpfModel, or a Mesh described as one.
+/// A PpfModel as it is, or a Mesh described as one.
 fn model_of(py: Python<'_>, argument: &str, model: &Bound<'_, PyAny>) -> PyResult<Arc<ObjectModel>> {
     match model.extract::<ModelOrMesh<'_>>() {
         Ok(ModelOrMesh::Model(model)) => Ok(model.get().model.clone()),
@@ -261,7 +277,7 @@ fn model_of(py: Python<'_>, argument: &str, model: &Bound<'_, PyAny>) -> PyResul
     }
 }
 
-/// What verification renders of a Mesh, or of the mesh of a PpfModel.
+/// The mesh that verification renders, of a Mesh or a PpfModel.
 pub(crate) fn rendered_of(py: Python<'_>, argument: &'static str, mesh: &Bound<'_, PyAny>) -> PyResult<Mesh> {
     match mesh.extract::<ModelOrMesh<'_>>() {
         Ok(ModelOrMesh::Model(model)) => Ok(model.get().model.mesh().clone()),
@@ -276,7 +292,7 @@ pub(crate) fn rendered_of(py: Python<'_>, argument: &'static str, mesh: &Bound<'
     }
 }
 
-/// What the verification says, as a dict.
+/// The scores of the verification as a dict.
 pub(crate) fn verification_to_python(py: Python<'_>, s: &VerificationScore) -> PyResult<Py<PyDict>> {
     let verification = PyDict::new(py);
     for (name, value) in

@@ -1,6 +1,6 @@
-//! `train_pix2pose`, `train_detector`, `train_dgcm`, `train_mttm`, `train_nol`, `train_views`, `train_refiner`, `train_proposals`: data in, a model file out. They report their
-//! progress, stop after the step in which Ctrl-C comes, and resume when they are called again with the same arguments. Without
-//! an argument, or with None, they take the default of the recipe.
+//! `train_pix2pose`, `train_detector`, `train_dgcm`, `train_mttm`, `train_nol`, `train_views`, `train_refiner`,
+//! `train_proposals`: from training data to a model file. They report their progress. Ctrl-C stops them after the current step,
+//! and a call with the same arguments resumes. An argument that is missing or None has the default of the recipe.
 
 use std::path::PathBuf;
 
@@ -11,26 +11,42 @@ use crate::arrays::{positive, whole};
 use crate::bop::json_to_python;
 use crate::training::{Source, checked, choice, count, run, single, steps, summary};
 
-/// Trains Pix2Pose (dissertation, chapter 3) on posed images and renders of objects; the model is what Pix2Pose.load
-/// reads. A dict with model (its path), steps, seconds, losses.
+/// Trains Pix2Pose (dissertation, chapter 3) on photographs with known poses and on renders of objects. Pix2Pose.load reads the
+/// model.
 ///
-/// material: the folder of a BOP dataset, a bop.Dataset, or {id: Mesh} to learn from renders alone. out: a folder that gets
-/// model.safetensors, and in training/ checkpoints, log.jsonl and curves.png. ids: objects of the dataset, all if None;
-/// frames: pairs (scene_id, im_id) of photographs to learn from, all of the split if None; renders_only=True opens none.
-/// network: "compact", which trains on two cores, or the dissertation's "paper" and "resnet50" for one object; steps,
-/// per_object (images of every object in a step) and learning_rate have its defaults if None. adversarial: against a
-/// discriminator; if None, all but the compact network. render_fraction and
-/// near_photographs: fraction of renders, and of those near a photograph's pose; rotation: largest rotation of photographs in the
-/// image plane, radians, 45 degrees if None; size: pixels of the network's input; init: a model to continue from; encoder: torchvision's ResNet-50
-/// weights for "resnet50"; backgrounds: a folder of photographs; preset: symmetries, thresholds
-/// and occlusion of one of the dissertation's experiments, "bop", "linemod", "lmo" or "tless", or all as "published".
+/// Returns a dict with model (its path), steps, seconds, losses.
 ///
-/// progress: called with a dict: stage ("training" or "measuring"), done, total, and while training seconds,
-/// learning_rate, samples_per_second, losses. Ctrl-C, or an error of the callback, ends the training after the current
-/// step, which is kept: the same call resumes, with the same result as if it had not been stopped. Symmetries that a mesh
-/// does not have are a warning.
+/// material: the folder of a BOP dataset, a bop.Dataset, or {id: Mesh} to train on renders only.
+/// out: a folder. It gets model.safetensors, and in training/ checkpoints, log.jsonl and curves.png.
+/// ids: objects of the dataset. None: all.
+/// frames: photographs to train on, as pairs (scene_id, im_id). None: all of the split.
+/// split: the split of the dataset. None: that of the bop.Dataset, or "test".
+/// renders_only: True uses no photographs.
+/// network: "compact", which trains on two cores, or the dissertation's "paper" and "resnet50" for one object.
+/// steps, per_object (images of every object in a step), learning_rate: None uses the network's default.
+/// adversarial: train against a discriminator. None: for all networks except the compact one.
+/// frozen_stages: number of frozen stages of the ImageNet encoder, of five.
+/// render_fraction: fraction of renders among the images, 0 to 1.
+/// near_photographs: fraction of renders whose pose is near that of a photograph, 0 to 1.
+/// rotation: largest rotation of photographs in the image plane, radians. None: 45 degrees.
+/// size: side of the network's input in pixels, a multiple of 32.
+/// init: a model to continue from.
+/// encoder: torchvision's ResNet-50 weights for "resnet50".
+/// backgrounds: a folder of photographs. None: procedural textures.
+/// mesh_colors: False renders the meshes in random colours.
+/// convex_hull: train on the coordinates of the meshes' convex hulls.
+/// transformer_loss: the loss for symmetric objects (equation 3.2); False uses plain L1.
+/// view_limits: plain L1, with one side of a symmetric object for all equivalent ones.
+/// preset: symmetries, thresholds and occlusion of one of the dissertation's experiments, "bop", "linemod", "lmo" or "tless"; or
+///     "published" for the dissertation's
+///     samples, loss and choice of the threshold, by default with network "paper" and no renders.
+/// progress: called with a dict: stage ("training" or "measuring"), done, total; while training also seconds, learning_rate,
+///     samples_per_second, losses.
 ///
-/// Raises OSError or ValueError for what cannot be read, options out of range, a folder with another training.
+/// Ctrl-C, or an error of the callback, ends the training after the current step, which is saved. The same call resumes it, with
+/// the same result as without the interruption. A symmetry that a mesh does not have causes a warning.
+///
+/// Raises OSError or ValueError for data that cannot be read, options out of range, and a folder that holds another training.
 ///
 /// >>> trained = train_pix2pose("data/demo", "out/pix2pose", ids=[8], steps=200, progress=print)  # doctest: +SKIP
 /// >>> pix2pose = Pix2Pose.load(trained["model"])  # doctest: +SKIP
@@ -100,18 +116,26 @@ pub(crate) fn train_pix2pose<'py>(
     summary(py, run(py, progress, recipe, material, out)?)
 }
 
-/// Trains a detector of known objects on photographs with their ground truth and renders; the model is what Detector.load
-/// reads. A dict with model (its path), steps, seconds, losses.
+/// Trains a detector of known objects on photographs with their ground truth and on renders. Detector.load reads the model.
 ///
-/// material, out, ids, frames, split, renders_only, init, backgrounds, progress, Ctrl-C and going on: as train_pix2pose.
-/// network: "compact", "retinanet" (without anchors), or the dissertation's "faster-rcnn", "mask-rcnn" and "retinanet-anchors", which need
-/// backbone="lite0" (EfficientNet-Lite0) or encoder: torchvision's weights of ResNet-50 or of the same network; batch: images in a step; encoder_rate: the pretrained encoder's
-/// fraction of the learning rate; size: side of the training images in pixels, a multiple of 32; photograph_fraction: fraction of
-/// training images that are parts of photographs; render_fraction: fraction of renders among pasted objects; rotation: largest rotation
-/// in the image plane, radians, 15 degrees if None; longest_side: larger images are reduced to so many pixels before detection; threshold: score
-/// below which detections are left out by default.
+/// Returns a dict with model (its path), steps, seconds, losses.
 ///
-/// Raises OSError or ValueError for what cannot be read, options out of range, a folder with another training.
+/// material, out, ids, frames, split, renders_only, init, backgrounds, progress, interruption and resuming: as train_pix2pose.
+/// network: "compact", "retinanet" (without anchors), or the dissertation's "faster-rcnn", "mask-rcnn" and "retinanet-anchors".
+///     The last three need backbone="lite0" (EfficientNet-Lite0), or encoder, or init.
+/// encoder: torchvision's weights of ResNet-50; for the dissertation's networks also those of the same network.
+/// batch: number of images in a step.
+/// encoder_rate: learning rate of the pretrained encoder as a fraction of the learning rate, 0 to 1.
+/// frozen_stages: number of frozen stages of the ImageNet encoder, of five.
+/// size: side of the training images in pixels, a multiple of 32.
+/// photograph_fraction: fraction of training images that are parts of photographs, 0 to 1.
+/// render_fraction: fraction of renders among pasted objects that have photographs, 0 to 1.
+/// rotation: largest rotation in the image plane, radians. None: 15 degrees.
+/// longest_side: before detection, larger images are reduced to this many pixels along their longer side.
+/// threshold: default score below which detections are left out, 0 to 1.
+/// mesh_colors: False renders the meshes in random colours.
+///
+/// Raises OSError or ValueError for data that cannot be read, options out of range, and a folder that holds another training.
 ///
 /// >>> trained = train_detector("data/demo", "out/detector", steps=200)  # doctest: +SKIP
 /// >>> detector = Detector.load(trained["model"])  # doctest: +SKIP
@@ -174,15 +198,18 @@ pub(crate) fn train_detector<'py>(
     summary(py, run(py, progress, recipe, material, out)?)
 }
 
-/// Trains the network for grasps from experience (dissertation, chapter 6) on synthetic objects; the model is what
-/// DgcmNet.load reads. A dict with model (its path), steps, seconds, losses.
+/// Trains the network for grasps from experience (dissertation, chapter 6) on synthetic objects. DgcmNet.load reads the model.
 ///
-/// out, progress, Ctrl-C and going on: as train_pix2pose; stage "preparing" comes first. network: "compact" or the
-/// dissertation's "paper"; steps, pairs (positive ones in a step), learning_rate and lambda_ (weight of the coordinates'
-/// loss) have its defaults if None; views: simulated views to learn from; encoder: torchvision's ResNet-50 weights for
-/// "paper".
+/// Returns a dict with model (its path), steps, seconds, losses.
 ///
-/// Raises OSError or ValueError for what cannot be read, options out of range, a folder with another training.
+/// out, progress, interruption and resuming: as train_pix2pose. The first stage is "preparing".
+/// network: "compact" or the dissertation's "paper".
+/// steps, pairs (positive pairs in a step), learning_rate, lambda_ (weight of the coordinates' loss): None uses the network's
+///     default.
+/// views: number of simulated views to train on.
+/// encoder: torchvision's ResNet-50 weights for "paper".
+///
+/// Raises OSError or ValueError for data that cannot be read, options out of range, and a folder that holds another training.
 ///
 /// >>> network = DgcmNet.load(train_dgcm("out/dgcm", steps=100, views=500)["model"])  # doctest: +SKIP
 #[pyfunction]
@@ -218,17 +245,28 @@ pub(crate) fn train_dgcm<'py>(
 }
 
 /// Trains the network that matches regions of depth images with templates (dissertation, chapter 5) on synthetic objects that
-/// fall on a table; the model is what Mttm takes as weights. A dict with model (its path), steps, seconds, losses, and quality,
-/// measured on objects that it was not trained on: regions (their number); fractions of them: nearest (own template the nearest of
-/// 40), masks (overlap by more than half), matching (pairs classified correctly); medians, of the nearest template and after the network's
-/// correction: rotation (radians), offset (fraction of a patch).
+/// fall on a table. Mttm takes the model as weights.
 ///
-/// out, progress, Ctrl-C and going on: as train_pix2pose; stage "preparing" comes first, and out gets an image of the first
-/// regions, samples.png. network: "compact", which trains on two cores, or the dissertation's "paper"; steps, anchors (regions
-/// with an object in a step) and learning_rate have its defaults if None; objects: synthetic objects, 16 or more; scenes: scenes
-/// of them, 4 or more, each seen by five cameras; encoder: torchvision's ResNet-50 weights for "paper".
+/// Returns a dict with model (its path), steps, seconds, losses, quality. quality is measured on objects that were not used in
+/// the training:
 ///
-/// Raises OSError or ValueError for what cannot be read, options out of range, a folder with another training.
+/// regions: number of regions.
+/// nearest: fraction of regions whose own template is the nearest of 40.
+/// masks: fraction of masks with an intersection over union above 0.5.
+/// matching: fraction of pairs classified correctly.
+/// rotation (radians), offset (fraction of a patch): median errors of the own template, and after the network's correction.
+///
+/// Arguments:
+///
+/// out, progress, interruption and resuming: as train_pix2pose. The first stage is "preparing", and out gets an image of the
+///     first regions, samples.png.
+/// network: "compact", which trains on two cores, or the dissertation's "paper".
+/// steps, anchors (regions with an object in a step), learning_rate: None uses the network's default.
+/// objects: number of synthetic objects, 16 or more.
+/// scenes: number of scenes of these objects, 4 or more, each rendered for five cameras.
+/// encoder: torchvision's ResNet-50 weights for "paper".
+///
+/// Raises OSError or ValueError for data that cannot be read, options out of range, and a folder that holds another training.
 ///
 /// >>> trained = train_mttm("out/mttm", steps=100, objects=32, scenes=16)  # doctest: +SKIP
 /// >>> known = Mttm(mesh, weights=trained["model"])  # doctest: +SKIP
@@ -268,16 +306,21 @@ pub(crate) fn train_mttm<'py>(
     Ok(dict)
 }
 
-/// Trains the network of Neural Object Learning (dissertation, chapter 4) on synthetic objects; the model is what synthesize
-/// takes as weights. A dict with model (its path), steps, seconds, losses, quality (how similar to the ground truth it renders objects
-/// that it was not trained on, beside plain averaging).
+/// Trains the network of Neural Object Learning (dissertation, chapter 4) on synthetic objects. synthesize takes the model as
+/// weights.
 ///
-/// out, progress, Ctrl-C and going on: as train_pix2pose. network: "compact" or the dissertation's "paper"; steps and
-/// learning_rate have its defaults if None; backgrounds: a folder of photographs for textures, synthetic ones only if None;
-/// lstm=False integrates the photographs' features by their mean; decoder=False leaves the decoder out; encoder:
-/// torchvision's DenseNet-121 weights for "paper".
+/// Returns a dict with model (its path), steps, seconds, losses, quality. quality is the similarity of rendered views to the
+/// ground truth, for objects that were not used in the training, compared with plain averaging.
 ///
-/// Raises OSError or ValueError for what cannot be read, options out of range, a folder with another training.
+/// out, progress, interruption and resuming: as train_pix2pose.
+/// network: "compact" or the dissertation's "paper".
+/// steps, learning_rate: None uses the network's default.
+/// backgrounds: a folder of photographs for textures. None: procedural ones only.
+/// lstm: False integrates the photographs' features by their mean.
+/// decoder: False leaves the decoder out.
+/// encoder: torchvision's DenseNet-121 weights for "paper".
+///
+/// Raises OSError or ValueError for data that cannot be read, options out of range, and a folder that holds another training.
 ///
 /// >>> trained = train_nol("out/nol", steps=100)  # doctest: +SKIP
 #[pyfunction]
@@ -323,10 +366,13 @@ pub(crate) fn train_nol<'py>(
 
 /// Trains the network that matches rendered views of any object with colour images, on synthetic objects.
 ///
-/// out, progress, Ctrl-C and going on: as train_pix2pose. backgrounds: a folder of photographs for textures, backgrounds and
-/// occluders, synthetic ones only if None; batch: objects in a step.
+/// Returns a dict with model (its path), steps, seconds, losses.
 ///
-/// Raises OSError or ValueError for what cannot be read, options out of range, a folder with another training.
+/// out, progress, interruption and resuming: as train_pix2pose.
+/// backgrounds: a folder of photographs for textures, backgrounds and occluders. None: procedural ones only.
+/// batch: number of objects in a step.
+///
+/// Raises OSError or ValueError for data that cannot be read, options out of range, and a folder that holds another training.
 ///
 /// >>> trained = train_views("out/views", steps=100)  # doctest: +SKIP
 #[pyfunction]
@@ -354,10 +400,14 @@ pub(crate) fn train_views<'py>(
 
 /// Trains the network that refines poses of any object in colour images, on synthetic objects.
 ///
-/// out, progress, Ctrl-C and going on: as train_pix2pose. backgrounds: a folder of photographs for textures, backgrounds and
-/// occluders, synthetic ones only if None; init: a model to continue from; batch: objects in a step, of each four poses.
+/// Returns a dict with model (its path), steps, seconds, losses.
 ///
-/// Raises OSError or ValueError for what cannot be read, options out of range, a folder with another training.
+/// out, progress, interruption and resuming: as train_pix2pose.
+/// backgrounds: a folder of photographs for textures, backgrounds and occluders. None: procedural ones only.
+/// init: a model to continue from.
+/// batch: number of objects in a step, each with four poses.
+///
+/// Raises OSError or ValueError for data that cannot be read, options out of range, and a folder that holds another training.
 ///
 /// >>> trained = train_refiner("out/refiner", steps=100)  # doctest: +SKIP
 #[pyfunction]
@@ -388,13 +438,17 @@ pub(crate) fn train_refiner<'py>(
     summary(py, run(py, progress, checked(recipe)?, (), out)?)
 }
 
-/// Trains a detector of any object in colour images, on synthetic objects: the proposals of the method "views" without boxes.
+/// Trains a detector of any object in colour images, on synthetic objects. Without boxes, the method "views" uses its proposals.
 ///
-/// out, progress, Ctrl-C and going on: as train_pix2pose. backgrounds: a folder of photographs for textures and backgrounds,
-/// synthetic ones only if None; batch: images in a step; objects: synthetic objects to learn from; size: side of the training
-/// images in pixels.
+/// Returns a dict with model (its path), steps, seconds, losses.
 ///
-/// Raises OSError or ValueError for what cannot be read, options out of range, a folder with another training.
+/// out, progress, interruption and resuming: as train_pix2pose.
+/// backgrounds: a folder of photographs for textures and backgrounds. None: procedural ones only.
+/// batch: number of images in a step.
+/// objects: number of synthetic objects to train on.
+/// size: side of the training images in pixels, a multiple of 32.
+///
+/// Raises OSError or ValueError for data that cannot be read, options out of range, and a folder that holds another training.
 ///
 /// >>> trained = train_proposals("out/proposals", steps=100)  # doctest: +SKIP
 #[pyfunction]

@@ -1,4 +1,4 @@
-//! Rendering on the CPU: depth, masks, normals, object coordinates, colour; and what a depth camera would see.
+//! Rendering on the CPU: depth, masks, normals, object coordinates, colour; and simulation of a depth camera.
 
 use std::sync::Arc;
 
@@ -16,15 +16,20 @@ use crate::camera::PyCamera;
 use crate::guard::free;
 use crate::mesh::PyMesh;
 
-/// What `render` draws: depth (H, W) float32 metres, 0 where nothing is seen; mask (H, W) bool; normals (H, W, 3)
-/// float32 unit, in the camera frame, to the camera, 0 where nothing is seen; coordinates (H, W, 3) float32, the point
-/// seen in the object's frame in metres, NaN where nothing is seen; rgb (H, W, 3) uint8. Unpacks in this order.
+/// The result of `render`. It unpacks in the following order.
+///
+/// depth: (H, W) float32, metres; 0 where the object is not visible.
+/// mask: (H, W) bool.
+/// normals: (H, W, 3) float32, unit normals in the camera frame that point towards the camera; 0 where the object is not
+///     visible.
+/// coordinates: (H, W, 3) float32, the visible point in the object's frame, metres; NaN where the object is not visible.
+/// rgb: (H, W, 3) uint8.
 #[pyclass(name = "Rendering", module = "sixfold", frozen)]
 pub(crate) struct Rendering {
     /// Depth in metres.
     #[pyo3(get)]
     depth: Py<PyArray2<f32>>,
-    /// Where the object is seen.
+    /// Where the object is visible.
     #[pyo3(get)]
     mask: Py<PyArray2<bool>>,
     /// Unit normals in the camera frame.
@@ -51,23 +56,23 @@ impl Rendering {
     }
 }
 
-/// What `render_scene` draws: as `Rendering`, but masks (K, H, W) bool, one an object, and instances (H, W) int32, the
-/// number of the object seen, -1 for none.
+/// The result of `render_scene`. Its attributes are those of `Rendering`, except that masks (K, H, W) bool has one mask per
+/// object and instances (H, W) int32 is the index of the visible object, -1 for none. It does not unpack.
 #[pyclass(name = "SceneRendering", module = "sixfold", frozen)]
 pub(crate) struct SceneRendering {
     /// Depth in metres.
     #[pyo3(get)]
     depth: Py<PyArray2<f32>>,
-    /// Where each object is seen, (K, H, W).
+    /// Where each object is visible, (K, H, W).
     #[pyo3(get)]
     masks: Py<PyArray3<bool>>,
-    /// Number of the object seen, -1 for none.
+    /// Index of the visible object, -1 for none.
     #[pyo3(get)]
     instances: Py<PyArray2<i32>>,
     /// Unit normals in the camera frame.
     #[pyo3(get)]
     normals: Py<PyArray3<f32>>,
-    /// Coordinates in the frame of the object seen, metres.
+    /// Coordinates in the frame of the visible object, metres.
     #[pyo3(get)]
     coordinates: Py<PyArray3<f32>>,
     /// Colour.
@@ -75,7 +80,7 @@ pub(crate) struct SceneRendering {
     rgb: Py<PyArray3<u8>>,
 }
 
-/// Light from everywhere. Colours are linear, 1 is full white.
+/// Ambient light, equal from all directions. Colours are linear; 1 is full white.
 ///
 /// >>> light = AmbientLight((0.5, 0.5, 0.5))
 /// >>> drawn = render(mesh, pose, camera, lights=[light])  # doctest: +SKIP
@@ -92,10 +97,9 @@ impl AmbientLight {
     }
 }
 
-/// Light from infinitely far away that travels along `direction` (3,) in the camera frame. Colours are linear, 1 is full
-/// white.
+/// Light from infinitely far away that travels along `direction` (3,) in the camera frame. Colours are linear; 1 is full white.
 ///
-/// Raises ValueError for a direction without a length, a colour below 0.
+/// Raises ValueError for a zero direction and a negative colour.
 ///
 /// >>> light = DirectionalLight((0, 0.3, 1))  # from behind the camera, and from above
 #[pyclass(name = "DirectionalLight", module = "sixfold", frozen, from_py_object)]
@@ -109,14 +113,14 @@ impl DirectionalLight {
     fn new(direction: &Bound<'_, PyAny>, color: [f32; 3]) -> PyResult<Self> {
         let direction = arrays::vector3("direction", direction)?;
         if direction.norm() < 1e-12 {
-            return Err(bad("direction", "a direction with a length", "zeros"));
+            return Err(bad("direction", "a direction that is not zero", "zeros"));
         }
         Ok(DirectionalLight(direction, light_color(color)?))
     }
 }
 
-/// Light from `position` (3,) in the camera frame, metres, falling off with the square of the distance; `color` is that
-/// at one metre, linear.
+/// Light from `position` (3,) in the camera frame, metres. It decreases with the square of the distance; `color` is its linear
+/// colour at one metre.
 ///
 /// >>> light = PointLight((0, -0.5, 0))  # half a metre above the camera
 #[pyclass(name = "PointLight", module = "sixfold", frozen, from_py_object)]
@@ -162,7 +166,7 @@ fn lights_of(lights: Option<&Bound<'_, PyAny>>) -> PyResult<Vec<Light>> {
     Ok(out)
 }
 
-/// How an image is drawn, checked.
+/// The checked options of rendering.
 struct Style {
     lights: Vec<Light>,
     material: Material,
@@ -224,14 +228,18 @@ fn draw(camera: &Camera, objects: &[(Arc<Mesh>, Pose)], style: &Style) -> Drawn 
     }
 }
 
-/// Draws a mesh at camera_from_object (4, 4) with our own rasteriser on the CPU (Pineda 1988); pixel centres lie at whole
-/// numbers. The image is a pinhole's: a distortion of the camera is not drawn.
+/// Renders a mesh at camera_from_object (4, 4) with Sixfold's own rasteriser on the CPU (Pineda 1988). Pixel centres have
+/// integer coordinates. The image is that of a pinhole camera: the camera's distortion is ignored.
 ///
-/// lights: a list of AmbientLight, DirectionalLight and PointLight in the camera frame (default: soft light and a lamp
-/// beside the camera); background: (H, W, 3) uint8; specular and shininess: Blinn's highlight; plain_color: of meshes
-/// without colours; near: metres, what lies nearer is cut off.
+/// lights: a list of AmbientLight, DirectionalLight and PointLight in the camera frame. None: soft ambient light and a
+///     directional light from beside the camera.
+/// background: (H, W, 3) uint8.
+/// specular, shininess: strength and exponent of Blinn's highlight.
+/// plain_color: colour of meshes without colours.
+/// near: surfaces nearer than this are cut off, metres.
+/// cull_back_faces: leave out triangles that face away from the camera.
 ///
-/// Raises ValueError for a pose that is none, or a background of another size.
+/// Raises ValueError for an invalid pose and a background of another size than the camera's.
 ///
 /// >>> import numpy as np
 /// >>> square = Mesh([[-0.1, -0.1, 0], [0.1, -0.1, 0], [0.1, 0.1, 0], [-0.1, 0.1, 0]], [[0, 1, 2], [0, 2, 3]])
@@ -277,9 +285,9 @@ pub(crate) fn render(
     })
 }
 
-/// Draws several objects, [(mesh, camera_from_object (4, 4)), ...], into one image; see render for the other arguments.
+/// Renders several objects, [(mesh, camera_from_object (4, 4)), ...], into one image. The other arguments are those of render.
 ///
-/// Raises ValueError for no object, a pose that is none, or a background of another size.
+/// Raises ValueError if there is no object, for an invalid pose and for a background of another size than the camera's.
 ///
 /// >>> import numpy as np
 /// >>> square = Mesh([[-0.1, -0.1, 0], [0.1, -0.1, 0], [0.1, 0.1, 0], [-0.1, 0.1, 0]], [[0, 1, 2], [0, 2, 3]])
@@ -328,7 +336,7 @@ pub(crate) fn render_scene(
     })
 }
 
-/// `[(mesh, camera_from_object), ...]`, at least one.
+/// `[(mesh, camera_from_object), ...]` with at least one entry.
 pub(crate) fn posed_objects(
     argument: &'static str,
     objects: &Bound<'_, PyAny>,
@@ -352,8 +360,8 @@ pub(crate) fn posed_objects(
     Ok(out)
 }
 
-/// The depth (H, W) float32 in metres of a mesh at camera_from_object (4, 4), 0 where it is not seen: what render gives
-/// first, without the rest.
+/// Renders only the depth (H, W) float32 of a mesh at camera_from_object (4, 4), metres; 0 where it is not visible. It is the
+/// depth of render.
 ///
 /// >>> import numpy as np
 /// >>> square = Mesh([[-0.1, -0.1, 0], [0.1, -0.1, 0], [0.1, 0.1, 0], [-0.1, 0.1, 0]], [[0, 1, 2], [0, 2, 3]])
@@ -372,10 +380,10 @@ pub(crate) fn render_depth<'py>(
     arrays::from_image(py, free(py, || sixfold::render::render_depth(&mesh.mesh, &pose, &camera))?)
 }
 
-/// Depth (H, W) float32 in metres as a Kinect-class camera would measure it, from ideal depth (H, W) and the normals
-/// (H, W, 3) of the same image (Nguyen et al. 2012; Khoshelham and Elberink 2012). The same seed gives the same bytes.
+/// Simulates the depth (H, W) float32 in metres that a depth camera like the Kinect measures, from ideal depth (H, W) and the
+/// normals (H, W, 3) of the same image (Nguyen et al. 2012; Khoshelham and Elberink 2012). The same seed gives the same bytes.
 ///
-/// Raises ValueError when the images differ in size.
+/// Raises ValueError if the images differ in size.
 ///
 /// >>> import numpy as np
 /// >>> normals = np.zeros((4, 6, 3), np.float32); normals[..., 2] = -1
@@ -399,8 +407,10 @@ pub(crate) fn simulate_depth<'py>(
     arrays::from_image(py, out)
 }
 
-/// The table under posed objects, [(mesh, camera_from_object (4, 4)), ...]: a Plane in the camera frame, normal up, or
-/// None. The camera is taken to be held upright and above the table.
+/// Estimates the table on which most of the objects [(mesh, camera_from_object (4, 4)), ...] stand: a Plane in the camera frame
+/// with its normal up, or None. The camera is assumed to be upright (within 80 degrees) and above the table.
+///
+/// Raises ValueError if there is no object.
 ///
 /// >>> table = support_plane([(mesh, pose)])  # doctest: +SKIP
 #[pyfunction]

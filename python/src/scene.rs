@@ -8,13 +8,14 @@ use crate::arrays::{self, bad, positive, seed, whole};
 use crate::camera::PyCamera;
 use crate::guard::{free, interruptible};
 
-/// Unit normals (H, W, 3) float32 in the camera frame, turned to the camera, from depth (H, W) in metres; 0 where depth is
-/// missing (Hinterstoisser et al. 2012, section 3.3).
+/// Computes unit normals (H, W, 3) float32 in the camera frame, pointing towards the camera, from depth (H, W) in metres
+/// (Hinterstoisser et al. 2012, section 3.3). They are 0 where depth is missing or fewer than six neighbours lie on the same
+/// surface.
 ///
-/// radius: half width of the window in pixels; max_relative_step: a neighbour counts when its depth differs by less than
-/// this fraction.
+/// radius: half width of the window in pixels (default 3). Values above 64 count as 64.
+/// max_relative_step: a neighbour counts if its depth differs by less than this fraction of the depth (default 0.02).
 ///
-/// Raises ValueError when depth and camera differ in size.
+/// Raises ValueError if depth and camera differ in size.
 ///
 /// >>> import numpy as np
 /// >>> normals_from_depth(np.ones((480, 640), np.float32), Camera(500, 500, 320, 240, 640, 480))[240, 320].round(6)
@@ -41,7 +42,7 @@ pub(crate) fn normals_from_depth<'py>(
     arrays::from_image_of(py, normals)
 }
 
-/// Depth (H, W) with holes filled from their borders, up to 2 * rounds pixels wide.
+/// Fills holes in depth (H, W) from their borders, up to 2 * rounds pixels wide.
 ///
 /// >>> import numpy as np
 /// >>> inpaint_depth(np.array([[1, 0, 1]], np.float32), 1)
@@ -54,15 +55,15 @@ pub(crate) fn inpaint_depth<'py>(
     rounds: i64,
 ) -> PyResult<Bound<'py, PyArray2<f32>>> {
     let (depth, rounds) = (arrays::depth("depth", depth)?, whole("rounds", rounds, 0)?);
-    // More rounds than the image has pixels along a side change nothing.
+    // More rounds than the longer side of the image has pixels change nothing.
     let rounds = rounds.min(depth.width().max(depth.height()));
     arrays::from_image(py, free(py, || sixfold::geometry::inpaint_depth(&depth, rounds))?)
 }
 
-/// The points (N, 3) float64 in the camera frame of a depth image (H, W) in metres, one a valid pixel, and their normals
-/// (N, 3); pixels without a normal are left out.
+/// Computes the points (N, 3) float64 in the camera frame of a depth image (H, W) in metres, and their normals (N, 3). There is
+/// one point per valid pixel; pixels without a normal are left out.
 ///
-/// Raises ValueError when depth and camera differ in size.
+/// Raises ValueError if depth and camera differ in size.
 ///
 /// >>> import numpy as np
 /// >>> points, normals = point_cloud(np.ones((48, 64), np.float32), Camera(50, 50, 32, 24, 64, 48))
@@ -84,8 +85,10 @@ pub(crate) fn point_cloud<'py>(
     Ok((arrays::from_points3(py, &cloud.points)?, arrays::from_points3(py, &cloud.normals)?))
 }
 
-/// One point a voxel of edge `size` metres and a group of similar normals in it (Vidal et al. 2018, section 3.1): points
-/// (N, 3), normals (N, 3) or None; returns the same.
+/// Downsamples points (N, 3) with normals (N, 3) or None to one point per voxel of edge `size` metres and per group of similar
+/// normals in it (Vidal et al. 2018, section 3.1). Returns points and normals, or None without normals.
+///
+/// max_angle: largest angle between the normals of a group and its first one, radians.
 ///
 /// >>> import numpy as np
 /// >>> points, normals = voxel_downsample(np.zeros((10, 3)), 0.01)
@@ -107,7 +110,7 @@ pub(crate) fn voxel_downsample<'py>(
     if let Some(n) = &normals
         && n.len() != points.len()
     {
-        return Err(bad("normals", format!("{} normals, one a point", points.len()), n.len().to_string()));
+        return Err(bad("normals", format!("{} normals, one per point", points.len()), n.len().to_string()));
     }
     let with_normals = normals.is_some();
     let cloud = PointCloud { points, normals: normals.unwrap_or_default() };
@@ -134,7 +137,7 @@ impl PyPlane {
         self.0.offset
     }
 
-    /// Signed distances (N,) of points (N, 3), positive on the side the normal points to; metres.
+    /// Signed distances (N,) of points (N, 3), metres; positive on the side to which the normal points.
     fn distance<'py>(
         &self,
         py: Python<'py>,
@@ -150,8 +153,11 @@ impl PyPlane {
     }
 }
 
-/// The plane that holds most of the points (N, 3), found by RANSAC (Fischler and Bolles 1981), normal to the origin; None
-/// when none holds `min_fraction` of them. threshold in metres; with normals (N, 3) these must agree within 30 degrees.
+/// Finds the plane with the most points of (N, 3) by RANSAC (Fischler and Bolles 1981). Its normal points towards the origin.
+/// None if no plane has at least `min_fraction` of the points.
+///
+/// threshold: distance within which a point belongs to the plane, metres. normals (N, 3): if given, they must agree with the
+/// plane's within 30 degrees. iterations: number of random samples.
 ///
 /// >>> import numpy as np
 /// >>> grid = np.stack(np.meshgrid(np.linspace(-1, 1, 20), np.linspace(-1, 1, 20), [1.0]), -1).reshape(-1, 3)
@@ -174,7 +180,7 @@ pub(crate) fn dominant_plane(
     if !normals.is_empty() && normals.len() != points.len() {
         return Err(bad(
             "normals",
-            format!("{} normals, one a point", points.len()),
+            format!("{} normals, one per point", points.len()),
             normals.len().to_string(),
         ));
     }
@@ -189,7 +195,9 @@ pub(crate) fn dominant_plane(
     Ok(plane.map(PyPlane))
 }
 
-/// The least-squares plane through points (N, 3). Raises ValueError for fewer than three or points on one line.
+/// Computes the least-squares plane through points (N, 3).
+///
+/// Raises ValueError for fewer than three points, or points on one line.
 ///
 /// >>> fit_plane([[0, 0, 1], [1, 0, 1], [0, 1, 1]]).distance([[0, 0, 3]])
 /// array([2.])
@@ -197,11 +205,11 @@ pub(crate) fn dominant_plane(
 pub(crate) fn fit_plane(py: Python<'_>, points: &Bound<'_, PyAny>) -> PyResult<PyPlane> {
     let points = arrays::points3("points", points)?;
     let plane = free(py, || sixfold::geometry::fit_plane(&points))?;
-    let found = format!("{} points that do not fix a plane", points.len());
+    let found = format!("{} points that do not determine a plane", points.len());
     plane.map(PyPlane).ok_or_else(|| bad("points", "at least three points that are not on one line", found))
 }
 
-/// `count` evenly spread unit directions (N, 3): a Fibonacci sphere (Gonzalez 2010).
+/// Computes `count` evenly distributed unit directions (N, 3): a Fibonacci sphere (Gonzalez 2010).
 ///
 /// >>> sphere_directions(100).shape
 /// (100, 3)

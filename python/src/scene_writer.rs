@@ -1,4 +1,4 @@
-//! `bop.SceneWriter`, `write_models`, `write_targets`, `write_camera`: datasets in the BOP format, written here.
+//! `bop.SceneWriter`, `write_models`, `write_targets`, `write_camera`: they write datasets in the BOP format.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -15,8 +15,8 @@ use crate::camera::PyCamera;
 use crate::guard::{dataset_error, free, mesh_file_error, os_error};
 use crate::mesh::PyMesh;
 
-/// Writes a scene of a BOP dataset, `path/split/000001` and the like: images with add, the text files with finish, which the
-/// end of a with block calls. Folders are made as needed; text files of a scene that is there are replaced.
+/// Writes a scene of a BOP dataset, for example `path/split/000001`. `add` writes the images. `finish` writes the text files; the
+/// end of a with block calls it. Folders are created as needed. Existing text files of the scene are replaced.
 ///
 /// >>> with SceneWriter("out/mine", "train", scene_id=1) as scene:  # doctest: +SKIP
 /// ...     scene.add(0, camera, [(8, pose)], rgb=rgb, depth=depth, meshes={8: mesh})
@@ -30,15 +30,19 @@ impl PySceneWriter {
         Ok(PySceneWriter(Mutex::new(SceneWriter::new(&path, split, id("scene_id", scene_id)?))))
     }
 
-    /// Writes the files of an image and keeps its text for finish.
+    /// Writes the files of an image and keeps its entries of the text files for `finish`.
     ///
-    /// camera: without distortion; objects: ground truth, [(obj_id, camera_from_object (4, 4)), ...]; rgb (H, W, 3) uint8;
-    /// depth (H, W) in metres, written in steps of mm_per_unit millimetres (BOP's depth_scale; 16 bits reach 6.5 m with 0.1);
-    /// camera_from_world (4, 4), where there is a world. meshes: {obj_id: Mesh} of all its objects, to write masks, boxes and
-    /// visibility as BOP defines them too.
+    /// camera: the camera, without distortion.
+    /// objects: the ground truth, [(obj_id, camera_from_object (4, 4)), ...].
+    /// rgb: (H, W, 3) uint8.
+    /// depth: (H, W), metres. It is written in steps of mm_per_unit millimetres (BOP's depth_scale); 16 bits reach 6.5 m with
+    ///     0.1.
+    /// camera_from_world: (4, 4), if there is a world frame.
+    /// meshes: {obj_id: Mesh} of all objects in the image. If given, masks, boxes and visibility as defined by BOP are also
+    ///     written.
     ///
-    /// Raises ValueError for images of another size than the camera's, a mesh that is missing; OSError when a file cannot
-    /// be written.
+    /// Raises ValueError for a camera with distortion, an image of another size than the camera's and a missing mesh; OSError if
+    /// a file cannot be written.
     #[pyo3(signature = (im_id, camera, objects, *, rgb=None, depth=None, mm_per_unit=0.1, camera_from_world=None, meshes=None))]
     #[allow(clippy::too_many_arguments)]
     fn add(
@@ -118,10 +122,10 @@ impl PySceneWriter {
         .map_err(dataset_error)
     }
 
-    /// Writes scene_camera.json, scene_gt.json and, where meshes were given, scene_gt_info.json. May be called at any time, to
-    /// save what there is so far.
+    /// Writes scene_camera.json, scene_gt.json and, if meshes were given, scene_gt_info.json. It may be called at any time to
+    /// save the images written so far.
     ///
-    /// Raises OSError when they cannot be written.
+    /// Raises OSError if a file cannot be written.
     fn finish(&self, py: Python<'_>) -> PyResult<()> {
         free(py, || self.writer().finish())?.map_err(dataset_error)
     }
@@ -143,10 +147,10 @@ impl PySceneWriter {
     }
 }
 
-/// Writes the models of a dataset, {obj_id: Mesh}, with their diameters and symmetries: path/models/obj_000001.ply and the
-/// like, in millimetres, and models_info.json.
+/// Writes the models of a dataset, {obj_id: Mesh}, with their diameters and symmetries: path/models/obj_000001.ply and so on, in
+/// millimetres, and models_info.json.
 ///
-/// Raises OSError when they cannot be written.
+/// Raises OSError if a file cannot be written.
 ///
 /// >>> write_models("out/mine", {8: mesh})  # doctest: +SKIP
 #[pyfunction]
@@ -168,9 +172,10 @@ fn write_models(py: Python<'_>, path: PathBuf, meshes: BTreeMap<u32, Py<PyMesh>>
     written.map_err(mesh_file_error)
 }
 
-/// Writes a targets file, what has to be found: [(scene_id, im_id, obj_id, count), ...] as Dataset.targets gives.
+/// Writes a targets file, which lists the objects to find: [(scene_id, im_id, obj_id, count), ...], as returned by
+/// Dataset.targets.
 ///
-/// Raises OSError when it cannot be written.
+/// Raises OSError if the file cannot be written.
 ///
 /// >>> write_targets("out/mine/test_targets_bop19.json", [(1, 0, 8, 1)])  # doctest: +SKIP
 #[pyfunction]
@@ -184,9 +189,9 @@ fn write_targets(py: Python<'_>, path: PathBuf, targets: Vec<(i64, i64, i64, i64
     free(py, || sixfold::bop::write_targets(&path, &targets))?.map_err(dataset_error)
 }
 
-/// Writes the camera.json of the dataset in a folder; mm_per_unit is BOP's depth_scale.
+/// Writes the camera.json of a dataset into the folder `path`. mm_per_unit is BOP's depth_scale.
 ///
-/// Raises ValueError for a camera with distortion, OSError when it cannot be written.
+/// Raises ValueError for a camera with distortion; OSError if the file cannot be written.
 ///
 /// >>> write_camera("out/mine", Camera(572, 573, 325, 242, 640, 480), mm_per_unit=0.1)  # doctest: +SKIP
 #[pyfunction]
@@ -195,7 +200,7 @@ fn write_camera(py: Python<'_>, path: PathBuf, camera: PyCamera, mm_per_unit: f6
     free(py, || sixfold::bop::write_camera(&path, &camera, scale))?.map_err(dataset_error)
 }
 
-/// Adds what is in this file to `sixfold.bop`.
+/// Adds the classes and functions of this file to `sixfold.bop`.
 pub(crate) fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<PySceneWriter>()?;
     module.add_function(wrap_pyfunction!(write_models, module)?)?;

@@ -1,4 +1,4 @@
-//! What trainings have in common: what they learn from, what they report, and how they are stopped.
+//! The common part of all trainings: their data, their reports, and how they are interrupted.
 
 use std::collections::BTreeMap;
 use std::error::Error;
@@ -19,7 +19,7 @@ use crate::bop::PyDataset;
 use crate::guard::{Leave, Tell, dataset_error, interruptible, os_error, reporting};
 use crate::mesh::PyMesh;
 
-/// An `OSError` where a file is at the bottom of it, else a `ValueError`.
+/// An `OSError` if the error was caused by one of a file, otherwise a `ValueError`.
 pub(crate) fn file_or_value(error: &(dyn Error + 'static)) -> PyErr {
     let mut below = Some(error);
     while let Some(at) = below {
@@ -31,7 +31,7 @@ pub(crate) fn file_or_value(error: &(dyn Error + 'static)) -> PyErr {
     PyValueError::new_err(error.to_string())
 }
 
-/// What a training reports, as it crosses from its thread.
+/// An event of a training, as sent from its thread.
 enum Event {
     Warning(String),
     Preparing(usize, usize),
@@ -40,7 +40,7 @@ enum Event {
 }
 
 impl Event {
-    /// That something begins, the callback sees by its stage.
+    /// The event for the callback. Notes are left out: the stage already tells the callback what begins.
     fn of(event: TrainingEvent<'_>) -> Option<Event> {
         Some(match event {
             TrainingEvent::Note(_) => return None,
@@ -51,7 +51,7 @@ impl Event {
         })
     }
 
-    /// Warnings as Python's own; the rest for the user's callback.
+    /// Passes warnings to Python's `warnings` and other events to the user's callback.
     fn report(self, py: Python<'_>, progress: Option<&Py<PyAny>>) -> PyResult<()> {
         if let Event::Warning(text) = &self {
             py.import("warnings")?.call_method1("warn", (text,))?;
@@ -80,7 +80,7 @@ impl Event {
     }
 }
 
-/// Trains in `out`. Ctrl-C, or an error of the callback, ends the training after the current step, which is kept on the disk.
+/// Trains in `out`. Ctrl-C, or an error of the callback, ends the training after the current step, which is saved.
 pub(crate) fn run<R: Recipe + Send + 'static>(
     py: Python<'_>,
     progress: Option<Py<PyAny>>,
@@ -114,7 +114,7 @@ where
     }
 }
 
-/// What a training came to, as a dict.
+/// The result of a training as a dict.
 pub(crate) fn summary<'py, R>(py: Python<'py>, trained: Trained<R>) -> PyResult<Bound<'py, PyDict>> {
     let Trained { model, steps, seconds, losses, .. } = trained;
     let dict = PyDict::new(py);
@@ -125,13 +125,13 @@ pub(crate) fn summary<'py, R>(py: Python<'py>, trained: Trained<R>) -> PyResult<
     Ok(dict)
 }
 
-/// A recipe whose options are in their ranges, before its data are read.
+/// The recipe if its options are in their ranges. Checked before its data are read.
 pub(crate) fn checked<R: Recipe>(recipe: R) -> PyResult<R> {
     recipe.check().map_err(|error| bad(error.field, error.expected, error.found))?;
     Ok(recipe)
 }
 
-/// One of the names of a choice, or the default.
+/// The choice of this name, or the default.
 pub(crate) fn choice<C: Choice>(argument: &str, name: Option<&str>, default: C) -> PyResult<C> {
     let Some(name) = name else { return Ok(default) };
     let names = || C::ALL.iter().map(|choice| choice.name()).collect::<Vec<_>>().join(" or ");
@@ -143,17 +143,17 @@ pub(crate) fn count(argument: &str, value: Option<i64>, default: usize) -> PyRes
     value.map_or(Ok(default), |value| whole(argument, value, 0))
 }
 
-/// Steps, where some are given.
+/// The number of steps, if given.
 pub(crate) fn steps(value: Option<i64>) -> PyResult<Option<u64>> {
     value.map(|n| whole("steps", n, 0).map(|n| n as u64)).transpose()
 }
 
-/// A number of fewer digits, or the default.
+/// The number in single precision, or the default.
 pub(crate) fn single(value: Option<f64>, default: f32) -> f32 {
     value.map_or(default, |value| value as f32)
 }
 
-/// A BOP dataset by its folder, an opened one, or meshes by their ids.
+/// The training data: a BOP dataset, or meshes by their ids.
 pub(crate) enum Source {
     Dataset { root: PathBuf, split: String, ids: Vec<u32>, frames: FrameSelection },
     Meshes(Vec<(u32, sixfold::mesh::Mesh, ModelInfo)>),
@@ -169,7 +169,7 @@ impl Source {
     ) -> PyResult<Source> {
         if let Ok(meshes) = material.extract::<BTreeMap<u32, Py<PyMesh>>>() {
             if ids.is_some() || frames.is_some() || split.is_some() {
-                return Err(bad("ids, frames, split", "none beside meshes", "some"));
+                return Err(bad("ids, frames, split", "none with meshes", "some"));
             }
             if meshes.is_empty() {
                 return Err(bad("material", "at least one mesh", "none"));

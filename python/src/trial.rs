@@ -17,11 +17,12 @@ use crate::gripper::gripper_of;
 use crate::guard::interruptible;
 use crate::mesh::PyMesh;
 
-/// An object for trials: its mesh cut into convex parts, so that what is hollow stays hollow. Takes seconds, keep it.
+/// An object for trials: its mesh decomposed into convex parts, so that hollows stay hollow. The decomposition takes seconds;
+/// keep the result.
 ///
-/// convex=True takes the hull of the mesh as it is.
+/// convex: True uses the convex hull of the mesh as the only part. Ctrl-C interrupts it.
 ///
-/// Raises ValueError for a mesh without faces or without a volume. Ctrl-C is heard.
+/// Raises ValueError for a mesh without faces or without volume.
 ///
 /// >>> cube = Mesh([[x, y, z] for x in (0, .05) for y in (0, .05) for z in (0, .05)]).convex_hull()
 /// >>> solid = Solid(cube, convex=True)
@@ -50,16 +51,17 @@ impl PySolid {
         Ok(PySolid { mesh, parts: Arc::new(parts.map_err(about("mesh"))?) })
     }
 
-    /// How many convex parts it has.
+    /// Number of convex parts.
     #[getter]
     fn part_count(&self) -> usize {
         self.parts.parts().len()
     }
 
-    /// Where the object comes to rest on the table (z up, its top at z = 0) when it falls from just above it, over the
-    /// table's middle: (4, 4) world_from_object in metres, or None when it does not come to rest.
+    /// Simulates how the object falls from just above the table and comes to rest, and returns its pose at rest, (4, 4)
+    /// world_from_object in metres, moved to the centre of the table. None if it does not come to rest. The world's z axis
+    /// points up and the table's top is at z = 0.
     ///
-    /// start (4, 4): how it is rotated when it falls; its own z axis up, if None. Ctrl-C is heard.
+    /// start: the object's rotation when it falls, as a pose (4, 4). None: its own z axis points up. Ctrl-C interrupts it.
     #[pyo3(signature = (start=None))]
     fn rest<'py>(
         &self,
@@ -86,19 +88,20 @@ impl PySolid {
     }
 }
 
-/// What happened in a trial. True where the object was held.
+/// The result of a trial. True if the object was held.
 #[pyclass(name = "GraspTrial", module = "sixfold", frozen)]
 pub(crate) struct GraspTrial {
     report: TrialReport,
-    /// Where the object stood, (4, 4) float64, metres.
+    /// The pose at which the object stood, (4, 4) float64, metres.
     #[pyo3(get)]
     world_from_object: Py<PyArray2<f64>>,
 }
 
 #[pymethods]
 impl GraspTrial {
-    /// "held": lifted and shaken, the object is between both fingers; "blocked": the gripper cannot get there; "missed": it
-    /// closed on nothing; "lost_in_lift", "lost_in_shake".
+    /// The outcome. "held": after lift and shake the object is between both fingers. "blocked": the gripper cannot reach the
+    /// grasp without a collision. "missed": the fingers closed without the object. "lost_in_lift", "lost_in_shake": the object
+    /// was lost then.
     #[getter]
     fn outcome(&self) -> &'static str {
         match self.report.outcome {
@@ -122,25 +125,25 @@ impl GraspTrial {
         self.report.gap
     }
 
-    /// How much the object's origin rose, metres.
+    /// Height by which the object's origin rose, metres.
     #[getter]
     fn raised(&self) -> f64 {
         self.report.raised
     }
 
-    /// How far the object slid between the fingers, metres.
+    /// Distance by which the object slid between the fingers after they closed, metres.
     #[getter]
     fn slip(&self) -> f64 {
         self.report.slip
     }
 
-    /// How far it turned between the fingers, radians.
+    /// Angle by which the object rotated between the fingers after they closed, radians.
     #[getter]
     fn turn(&self) -> f64 {
         self.report.turn
     }
 
-    /// How far the object was moved before the lift, metres.
+    /// Distance by which the object was moved before the lift, metres.
     #[getter]
     fn pushed(&self) -> f64 {
         self.report.pushed
@@ -161,10 +164,11 @@ impl GraspTrial {
     }
 }
 
-/// The pose of a gripper (4, 4) whose finger tips have their middle at tip (3,), metres, from approach and closing direction
-/// (3,), which need not be unit nor exactly perpendicular: the approach keeps its direction.
+/// Computes the pose of a gripper (4, 4) from the centre between its finger tips, tip (3,) in metres, and its approach and
+/// closing directions (3,). They need not be unit vectors nor exactly perpendicular: the approach keeps its direction. By
+/// default the approach is (0, 0, -1) and the closing direction (1, 0, 0).
 ///
-/// Raises ValueError when they are parallel or zero.
+/// Raises ValueError if the directions are parallel or zero.
 ///
 /// >>> gripper_pose([0, 0, 0.02])[:3, 2]
 /// array([ 0.,  0., -1.])
@@ -187,16 +191,23 @@ pub(crate) fn gripper_pose<'py>(
     arrays::from_pose(py, &pose)
 }
 
-/// Tries one grasp in a physics engine: the gripper comes along its approach direction, closes with a limited force, lifts
-/// and shakes; nothing but Coulomb friction holds the object. The same arguments give the same result on every machine.
+/// Tries one grasp in a physics engine. The gripper moves along its approach direction, closes with a limited force, lifts and
+/// shakes. Only Coulomb friction holds the object. The same arguments give the same result on every machine.
 ///
-/// object: a Solid, or a Mesh, which is cut into convex parts first. world_from_gripper (4, 4): where the gripper closes, in
-/// the world's frame, z up, the table's top at z = 0, metres; that of a Grasp is world_from_camera @
-/// grasp.camera_from_gripper. world_from_object (4, 4): where the object stands, Solid.rest() if None. opening: distance of
-/// the pads before closing, metres, the gripper's largest if None. friction (of the pads) and force (of a finger, newtons)
-/// in place of the gripper's; mass of the object in kg; table_friction; lift in metres. Ctrl-C is heard.
+/// object: a Solid, or a Mesh, which is decomposed into convex parts first.
+/// world_from_gripper: the gripper's pose when it closes, (4, 4), metres. The world's z axis points up and the table's top is at
+///     z = 0. For a Grasp it is world_from_camera @ grasp.camera_from_gripper.
+/// world_from_object: the pose at which the object stands, (4, 4), metres. None: Solid.rest().
+/// gripper: a Gripper, or the name of a built-in one. None: "jaws-140".
+/// opening: distance of the pads before closing, metres. None: the gripper's maximum.
+/// friction, force: friction coefficient of the pads and force of a finger in newtons, instead of the gripper's.
+/// mass: mass of the object, kg.
+/// table_friction: friction coefficient of the table.
+/// lift: height of the lift, metres.
 ///
-/// Raises ValueError for a mesh without a volume, an object that does not come to rest, options out of range.
+/// Ctrl-C interrupts it.
+///
+/// Raises ValueError for a mesh without volume, an object that does not come to rest, and options out of range.
 ///
 /// >>> cube = Mesh([[x, y, z] for x in (0, .05) for y in (0, .05) for z in (0, .05)]).convex_hull()
 /// >>> trial = try_grasp(Solid(cube, convex=True), gripper_pose([0, 0, 0.01]), gripper="jaws-85")

@@ -23,7 +23,7 @@ Light: TypeAlias = "AmbientLight | DirectionalLight | PointLight"
 Dicts = list[dict[str, Any]]
 Texts = list[str]
 View = tuple[ArrayLike, Camera, ArrayLike] | tuple[ArrayLike, Camera, ArrayLike, ArrayLike]
-"""Depth, camera, mask, and the pose where it is known."""
+"""Depth, camera, mask, and the pose if it is known."""
 Progress = Callable[[dict[str, Any]], object]
 """Called with stage, done, total; dataset: image; training: seconds, learning_rate, samples_per_second, losses."""
 Levels = Iterable[tuple[float, int, int]]
@@ -366,7 +366,7 @@ class Estimate:
     def notes(self) -> Texts: ...
 
 class Estimator:
-    """A method of `sixfold estimate`, the same interface for all of them."""
+    """A pose estimation method of `sixfold estimate`. All methods have the same interface."""
 
     def __new__(
         cls,
@@ -383,13 +383,20 @@ class Estimator:
         budget: float | None = None,
         seed: int = 0,
     ) -> Estimator:
-        """weights: pix2pose (needed), mttm, views, auto; keep_plane: ppf, mttm, auto; budget, seconds: auto; matcher, templates_only, templates: mttm; refine: pix2pose, views;
-        others: pix2pose."""
+        """Creates an estimator. The methods that accept each option:
+
+        weights: pix2pose (required), mttm, views, auto.
+        keep_plane: ppf, mttm, auto.
+        matcher, templates_only, templates: mttm.
+        refine: pix2pose, views.
+        passes, icp: pix2pose.
+        budget (seconds): auto.
+        seed: all methods."""
     @property
     def name(self) -> str: ...
     @property
     def needs(self) -> dict[str, str]:
-        """Of depth, rgb, region and object: "required", "optional" or "unused"."""
+        """For each of depth, rgb, region and object: "required", "optional" or "unused"."""
     def find(
         self,
         object: Mesh | None,
@@ -403,7 +410,9 @@ class Estimator:
         *,
         id: int | None = None,
     ) -> list[Estimate]:
-        """Looks for an object in an image: best first, empty if not found. id: which of the weights' objects."""
+        """Searches for an object in an image. Returns estimates, best first; empty if it is not found.
+
+        id: which of the weights' objects to search for."""
     def run_dataset(
         self,
         path: Path,
@@ -417,7 +426,9 @@ class Estimator:
         cache: Path | None = None,
         progress: Progress | None = None,
     ) -> dict[str, Any]:
-        """Looks for all targets of a BOP dataset, into a result file. boxes: "gt", or a file of COCO detections."""
+        """Searches for all targets of a BOP dataset and writes a result file.
+
+        boxes: "gt" for those of the ground truth, or a file of COCO detections."""
 
 class Pix2PosePose:
     @property
@@ -641,7 +652,7 @@ class ExperienceStore:
         weights: DgcmNet | Path | None = None,
         seed: int = 0,
     ) -> tuple[int, bool]: ...
-    # Before `list`, which hides the type of this name in the class.
+    # Stands before `list`, because that method hides the built-in type in the rest of the class.
     def nearest(
         self,
         feature: ArrayLike,

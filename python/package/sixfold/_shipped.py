@@ -1,9 +1,9 @@
-"""Where the weights and samples are that come with Sixfold: the search order of the program (docs/install.md)."""
+"""Finds the weights and samples shipped with Sixfold, in the search order of the program (docs/install.md)."""
 
 import os
 from pathlib import Path
 
-#: Where each is in a checkout, and the file that a folder is known by.
+#: Path of each item in a checkout, and the file that identifies a folder ("" if the item is a file).
 _KNOWN = {
     "demo": ("data/demo", "test_targets_bop19.json"),
     "weights/pix2pose-lmo.safetensors": ("weights/pix2pose-lmo.safetensors", ""),
@@ -24,11 +24,14 @@ def _candidates(name, checkout):
 
 
 def shipped(name):
-    """Path of something that comes with Sixfold: the sample frames of LM-O, or a file of weights.
+    """Returns the path of an item shipped with Sixfold: the sample frames of LM-O, or a weight file.
 
-    Searched in this order: the folder that the environment variable ``SIXFOLD_SHARE`` names, and where it is set nothing
-    else; a checkout of the repository in the current folder or above it; this package; ``sixfold`` in the user's data
-    folder (``$XDG_DATA_HOME``, else ``~/.local/share``).
+    If the environment variable ``SIXFOLD_SHARE`` is set, only the folder that it names is searched. Otherwise the
+    search order is:
+
+    1. a checkout of the repository in the current folder or in a folder above it;
+    2. this package;
+    3. ``sixfold`` in the user's data folder (``$XDG_DATA_HOME`` if it is an absolute path, else ``~/.local/share``).
 
     Args:
         name: ``"demo"``, ``"weights/pix2pose-lmo.safetensors"``, ``"weights/detector-lmo.safetensors"`` or
@@ -38,8 +41,8 @@ def shipped(name):
         An absolute path.
 
     Raises:
-        ValueError: nothing of this name comes with Sixfold.
-        FileNotFoundError: it is in none of the places, which the message lists.
+        ValueError: no item with this name is shipped with Sixfold.
+        FileNotFoundError: it was not found. The message lists the places that were searched.
 
     >>> dataset = sixfold.bop.Dataset(sixfold.shipped("demo"))  # doctest: +SKIP
     """
