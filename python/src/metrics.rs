@@ -368,8 +368,8 @@ fn models_of(word: &str) -> PyResult<Models> {
 ///
 /// dataset: a bop.Dataset, or its folder, of which `split` is scored. results: a CSV file in BOP's format (millimetres) or a list
 /// of bop.Estimate. targets: a targets file (by default the dataset's test_targets_bop19.json, or without one every pose of the
-/// split that is at least 10 % visible). vsd=False leaves out VSD, which takes longest; its visibility tolerance is 15 mm for every
-/// dataset (BOP: 5 mm for ITODD). visib_gt_min: minimum visible fraction of a target, instead of BOP's rule. models: "eval" or
+/// split that is at least 10 % visible). vsd=False leaves out VSD, which takes longest; its visibility tolerance is 15 mm,
+/// or 5 mm for a dataset whose folder is named itodd. visib_gt_min: minimum visible fraction of a target, instead of BOP's rule. models: "eval" or
 /// "rendering". curves: a PNG file to write, with the recall curves. Ctrl-C interrupts it.
 ///
 /// Raises OSError for files that cannot be read, ValueError for broken ones.
@@ -392,8 +392,8 @@ fn bop19<'py>(
 ) -> PyResult<Bound<'py, PyAny>> {
     let dataset = dataset.open(split)?;
     let estimates = results.read()?;
-    let options =
-        EvalOptions { compute_vsd: vsd, visib_gt_min, models: models_of(models)?, ..EvalOptions::default() };
+    let usual = EvalOptions::for_dataset(dataset.root());
+    let options = EvalOptions { compute_vsd: vsd, visib_gt_min, models: models_of(models)?, ..usual };
     options.check().map_err(eval_error)?;
     let targets = dataset.targets(targets.as_deref()).map_err(dataset_error)?;
     let scores = interruptible(py, move |stop| {
@@ -427,7 +427,8 @@ fn bop24<'py>(
 ) -> PyResult<Bound<'py, PyAny>> {
     let dataset = dataset.open(split)?;
     let estimates = results.read()?;
-    let options = EvalOptions { visib_gt_min, models: models_of(models)?, ..EvalOptions::default() };
+    let usual = EvalOptions::for_dataset(dataset.root());
+    let options = EvalOptions { visib_gt_min, models: models_of(models)?, ..usual };
     options.check().map_err(eval_error)?;
     let targets = dataset.targets(targets.as_deref()).map_err(dataset_error)?;
     let scores = interruptible(py, move |_| evaluate_detection(&dataset, &estimates, &targets, &options))?

@@ -1,5 +1,7 @@
 """Pose errors against independent statements of the official toolkit's definitions in numpy."""
 
+import pathlib
+
 import numpy as np
 import pytest
 
@@ -113,6 +115,20 @@ def test_scores_of_the_ground_truth_are_perfect(demo, tmp_path):
     assert again["ar_mssd"] == 1.0 and again["ar_vsd"] is None and "VSD" in again["reasons"]["ar_vsd"]
     assert curves.stat().st_size > 1000
     assert metrics.bop24(demo, str(file))["ap_mssd"] == pytest.approx(1.0)
+
+
+def test_itodd_is_scored_with_its_own_tolerance(demo, tmp_path):
+    itodd = tmp_path / "ITODD"
+    itodd.symlink_to(pathlib.Path(demo).resolve(), target_is_directory=True)
+    dataset = bop.Dataset(demo)
+    estimates = []
+    for truth in dataset.ground_truth(2, 3):
+        moved = np.array(truth["camera_from_object"])
+        moved[2, 3] += 0.01
+        estimates.append(bop.Estimate(2, 3, truth["obj_id"], 1.0, moved))
+    scores = [metrics.bop19(folder, estimates)["ar_vsd"] for folder in (demo, itodd)]
+    # A point 10 mm behind the measured surface is visible with a tolerance of 15 mm, hidden with one of 5 mm.
+    assert scores[0] > scores[1] + 0.01
 
 
 def test_published_scores(demo):

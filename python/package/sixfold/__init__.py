@@ -5,7 +5,7 @@ numpy arrays in, poses out. Lengths are in metres, angles in radians. A pose is 
 The centre of the top left pixel is (0, 0). Only what says ``mm`` in its name is in millimetres (``sixfold.bop``).
 
 Bad input is a ``ValueError`` that names the argument, what was expected and what was found. ``NoSolutionError``, a
-``ValueError`` too, says that the input is fine and nothing fits it. Files that cannot be read are an ``OSError``.
+``ValueError`` too, says that the input is valid but has no solution. Files that cannot be read are an ``OSError``.
 The same input and seed give the same result.
 """
 
