@@ -243,7 +243,7 @@ impl ExperienceStore {
         let same =
             |a: &Path, b: &Path| matches!((a.canonicalize(), b.canonicalize()), (Ok(a), Ok(b)) if a == b);
         if same(&out, &self.path) {
-            return Err(bad("out", "a file other than the store itself", out.display().to_string()));
+            return Err(bad("out", "another file than the store itself", out.display().to_string()));
         }
         self.with(py, move |opened, stop| {
             let mut target = SqliteStore::create(&out)?;
