@@ -111,6 +111,16 @@ impl Pix2PoseEstimator {
         })
     }
 
+    /// Prepares what the alignment of an object's poses needs, which otherwise happens at its first pose.
+    pub fn prepare_alignment(&self, object: &Pix2PoseObject) {
+        if let (true, Some(mesh)) = (self.refine, &object.mesh) {
+            object.outline.get_or_init(|| outline_mesh(mesh));
+            if let Some(refiner) = self.refiner.as_ref().filter(|_| !self.icp) {
+                object.refined.get_or_init(|| refiner.object(mesh));
+            }
+        }
+    }
+
     /// The best pose of an object in a box of a pinhole image, before ICP; `None` if it is not visible there. Without a mesh the
     /// outline is not aligned.
     ///

@@ -7,6 +7,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use anyhow::{Result, bail};
+use rayon::prelude::*;
 use sixfold_bop::{BopDataset, Target};
 use sixfold_data::FrameId;
 use sixfold_detect::detector::TrainedDetector;
@@ -64,7 +65,11 @@ fn objects(
 ) -> Result<BTreeMap<u32, Pix2PoseObject>> {
     let wanted = |id: &u32| targets.iter().any(|t| t.object.is_some_and(|o| o.obj_id == *id));
     let wanted = known.iter().filter(|(id, _)| wanted(id));
-    wanted.map(|(id, k)| Ok((*id, pix2pose.object(&k.object)?))).collect()
+    let objects: Result<BTreeMap<u32, Pix2PoseObject>> =
+        wanted.map(|(id, k)| Ok((*id, pix2pose.object(&k.object)?))).collect();
+    let objects = objects?;
+    objects.par_iter().for_each(|(_, object)| pix2pose.prepare_alignment(object));
+    Ok(objects)
 }
 
 fn with_model(
