@@ -113,12 +113,17 @@ impl Pix2PoseEstimator {
 
     /// Prepares what the alignment of an object's poses needs, which otherwise happens at its first pose.
     pub fn prepare_alignment(&self, object: &Pix2PoseObject) {
-        if let (true, Some(mesh)) = (self.refine, &object.mesh) {
-            object.outline.get_or_init(|| outline_mesh(mesh));
-            if let Some(refiner) = self.refiner.as_ref().filter(|_| !self.icp) {
-                object.refined.get_or_init(|| refiner.object(mesh));
-            }
-        }
+        self.alignment(object);
+    }
+
+    /// What an object's poses are aligned by; `None` without a mesh, or if they are not aligned.
+    fn alignment<'a>(&self, object: &'a Pix2PoseObject) -> Option<AlignedObject<'a>> {
+        let mesh = object.mesh.as_ref().filter(|_| self.refine)?;
+        let outline = object.outline.get_or_init(|| outline_mesh(mesh));
+        // The depth image determines a pose better than the refiner does.
+        let refiner = self.refiner.as_ref().filter(|_| !self.icp);
+        let refined = refiner.map(|by| object.refined.get_or_init(|| by.object(mesh)));
+        Some(AlignedObject { id: object.id, outline, refiner: refined.map(AsRef::as_ref) })
     }
 
     /// The best pose of an object in a box of a pinhole image, before ICP; `None` if it is not visible there. Without a mesh the
@@ -133,13 +138,7 @@ impl Pix2PoseEstimator {
         object: &Pix2PoseObject,
         bbox: &Rect,
     ) -> Result<Option<Pix2PosePose>, EstimateError> {
-        let id = object.id;
-        if let (true, Some(mesh)) = (self.refine, &object.mesh) {
-            let outline = object.outline.get_or_init(|| outline_mesh(mesh));
-            // The depth image determines a pose better than the refiner does.
-            let refiner = self.refiner.as_ref().filter(|_| !self.icp);
-            let refined = refiner.map(|by| object.refined.get_or_init(|| by.object(mesh)));
-            let known = AlignedObject { id, outline, refiner: refined.map(AsRef::as_ref) };
+        if let Some(known) = self.alignment(object) {
             let aligned = estimate_aligned(&self.model, image, camera, known, bbox, &self.options)?;
             return Ok(aligned.map(|a| Pix2PosePose {
                 camera_from_object: a.camera_from_object,
@@ -149,7 +148,7 @@ impl Pix2PoseEstimator {
                 found: a.found,
             }));
         }
-        let found = estimate(&self.model, image, camera, id, bbox, &self.options.estimate)?;
+        let found = estimate(&self.model, image, camera, object.id, bbox, &self.options.estimate)?;
         Ok(found.and_then(|found| {
             let best = found.hypotheses.first()?;
             let (score, camera_from_object) = (best.score, best.camera_from_object);
