@@ -8,10 +8,12 @@ use std::time::Instant;
 
 use anyhow::{Result, bail};
 use rayon::prelude::*;
-use sixfold_bop::{BopDataset, Target};
+use sixfold_bop::{BopDataset, GroundTruth, Target};
 use sixfold_data::FrameId;
 use sixfold_detect::detector::TrainedDetector;
-use sixfold_pix2pose::estimator::{Pix2PoseEstimator, Pix2PoseObject};
+use sixfold_geometry::Rect;
+use sixfold_mesh::Mesh;
+use sixfold_pix2pose::estimator::{Pix2PoseEstimator, Pix2PoseObject, Pix2PosePose};
 use sixfold_runner::RegionSource;
 use sixfold_views::ViewsRefiner;
 
@@ -72,6 +74,16 @@ fn objects(
     Ok(objects)
 }
 
+/// A target with the box in which its object is searched.
+struct Boxed<'a> {
+    id: u32,
+    known: &'a Known,
+    bbox: Rect,
+    truth: &'a GroundTruth,
+    mesh: &'a Mesh,
+    object: &'a Pix2PoseObject,
+}
+
 fn with_model(
     out: &mut Pictures,
     pix2pose: &Pix2PoseEstimator,
@@ -106,33 +118,43 @@ fn with_model(
                 }
             }
             let camera = scene.camera(im_id)?;
-            let mut drawn = vec![];
+            let mut boxed = vec![];
             for t in targets.iter().filter(|t| (t.scene_id, t.im_id) == (scene_id, im_id)) {
                 let Some((o, k)) = t.object.and_then(|o| Some((o, known.get(&o.obj_id)?))) else { continue };
                 colour.targets += 1;
-                progress.step(format!("image {im_id}, object {}", o.obj_id));
                 let found = regions.of_target(&scene, t, &o, |id| known.get(&id).and_then(Known::mesh))?;
                 let truth = scene.image(im_id)?.ground_truth.iter().find(|g| g.obj_id == o.obj_id);
-                let (Some(region), Some(truth), Some(mesh)) = (found.first(), truth, k.mesh()) else {
-                    continue;
-                };
-                let start = Instant::now();
-                let Some(object) = objects.get(&o.obj_id) else { continue };
-                let Some(posed) = pix2pose.pose_in_box(&image, &camera, object, &region.bbox)? else {
-                    continue;
-                };
-                let error = add_s(k, posed.camera_from_object, truth);
+                match (found.first(), truth, k.mesh(), objects.get(&o.obj_id)) {
+                    (Some(region), Some(truth), Some(mesh), Some(object)) => {
+                        boxed.push(Boxed { id: o.obj_id, known: k, bbox: region.bbox, truth, mesh, object });
+                    }
+                    _ => progress.step(format!("image {im_id}, object {}: no region", o.obj_id)),
+                }
+            }
+            // Several objects at a time: a single pose hardly uses more than one core.
+            let found: Vec<Result<Option<(Pix2PosePose, f64)>>> = boxed
+                .par_iter()
+                .map(|b| {
+                    let start = Instant::now();
+                    let posed = pix2pose.pose_in_box(&image, &camera, b.object, &b.bbox)?;
+                    Ok(posed.map(|posed| (posed, start.elapsed().as_secs_f64())))
+                })
+                .collect();
+            let mut drawn = vec![];
+            for (b, found) in boxed.iter().zip(found) {
+                progress.step(format!("image {im_id}, object {}", b.id));
+                let Some((posed, seconds)) = found? else { continue };
+                let error = add_s(b.known, posed.camera_from_object, b.truth);
                 colour.poses.push(SamplePose {
                     depth: None,
                     image: format!("{scene_id}/{im_id}"),
-                    object: o.obj_id,
+                    object: b.id,
                     add_s_mm: 1000.0 * error,
-                    add_s_of_diameter: error / k.info.diameter,
+                    add_s_of_diameter: error / b.known.info.diameter,
                     confidence: posed.score,
-                    seconds: start.elapsed().as_secs_f64(),
+                    seconds,
                 });
-                let pose = posed.camera_from_object;
-                drawn.push(Drawn::of_dataset(o.obj_id, mesh, pose, posed.score));
+                drawn.push(Drawn::of_dataset(b.id, b.mesh, posed.camera_from_object, posed.score));
             }
             let picture = overlay::draw(&image, &camera, &drawn);
             colour.pictures.extend(out.write(&format!("{scene_id:06}_{im_id:06}_colour.png"), &picture));
