@@ -89,10 +89,11 @@ impl Detector {
     /// rgb: (H, W, 3) uint8, of any size; large images are downscaled for the network. object_ids: return only these objects.
     /// threshold: minimum score, 0 to 1, instead of the model's. overlap: if two boxes of an object have a larger intersection over
     /// union, 0 to 1, the one with the lower score is left out. per_object, max_detections: maximum number of detections of each
-    /// object and of all objects (before object_ids is applied). masks=False: compute no masks. Ctrl-C interrupts it.
+    /// object and of all objects (before object_ids is applied). scales: number of
+    /// sizes at which the image is processed, each smaller by the square root of two. masks=False: compute no masks. Ctrl-C interrupts it.
     ///
     /// Raises ValueError for an unknown object, an option out of range or an image without pixels.
-    #[pyo3(signature = (rgb, *, object_ids=None, threshold=None, overlap=0.5, per_object=100, max_detections=100, masks=true))]
+    #[pyo3(signature = (rgb, *, object_ids=None, threshold=None, overlap=0.5, per_object=100, max_detections=100, scales=1, masks=true))]
     #[allow(clippy::too_many_arguments)]
     fn __call__(
         &self,
@@ -103,6 +104,7 @@ impl Detector {
         overlap: f64,
         per_object: i64,
         max_detections: i64,
+        scales: i64,
         masks: bool,
     ) -> PyResult<Vec<DetectedObject>> {
         let image = arrays::rgb("rgb", rgb)?;
@@ -115,6 +117,7 @@ impl Detector {
             overlap: fraction("overlap", overlap)?,
             per_class: whole("per_object", per_object, 1)?,
             max_detections: whole("max_detections", max_detections, 1)?,
+            scales: whole("scales", scales, 1)?,
             masks,
         };
         let model = self.model.clone();

@@ -9,6 +9,9 @@ use sixfold_synth::augment::{AffineMap, Patch};
 /// Upper bound of the number of detections per image, of one object or of all.
 const MAX_DETECTIONS: usize = 10_000;
 
+/// Upper bound of [`DetectOptions::scales`]: the last image has an eighth of the first one's side.
+pub const MAX_SCALES: usize = 7;
+
 /// Which detections are returned.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct DetectOptions {
@@ -20,6 +23,9 @@ pub struct DetectOptions {
     pub per_class: usize,
     /// Maximum number of detections of an image, the best ones.
     pub max_detections: usize,
+    /// Number of sizes at which the network processes the image, each smaller by the square root of two: a detector of any object
+    /// finds large ones better in a reduced image. The networks with anchors, which have levels for that, use one.
+    pub scales: usize,
     /// Also compute masks.
     pub masks: bool,
 }
@@ -27,7 +33,7 @@ pub struct DetectOptions {
 impl Default for DetectOptions {
     /// For display and for poses: only confident detections.
     fn default() -> Self {
-        DetectOptions { threshold: 0.4, overlap: 0.5, per_class: 100, max_detections: 100, masks: true }
+        DetectOptions { threshold: 0.4, overlap: 0.5, per_class: 100, max_detections: 100, scales: 1, masks: true }
     }
 }
 
@@ -55,6 +61,12 @@ impl DetectOptions {
                     "detection option {field}: found {value}, expected 1 to {MAX_DETECTIONS}"
                 ));
             }
+        }
+        if !(1..=MAX_SCALES).contains(&self.scales) {
+            return Err(format!(
+                "detection option scales: found {}, expected 1 to {MAX_SCALES}",
+                self.scales
+            ));
         }
         Ok(())
     }
@@ -233,6 +245,23 @@ pub fn decode(
             Detected { class: c.class, score: c.score, bbox, mask }
         })
         .collect()
+}
+
+/// The detections of several scales of an image, best first, suppressed as those of one are.
+pub(crate) fn merged(mut scales: Vec<Vec<Detected>>, options: &DetectOptions) -> Vec<Detected> {
+    if scales.len() == 1 {
+        return scales.remove(0);
+    }
+    let mut all: Vec<Option<Detected>> = scales.into_iter().flatten().map(Some).collect();
+    let candidate = |(location, d): (usize, &Option<Detected>)| {
+        let d = d.as_ref()?;
+        let (right, bottom) = (d.bbox.x + d.bbox.width, d.bbox.y + d.bbox.height);
+        let corners = [d.bbox.x, d.bbox.y, right, bottom].map(|v| v as f32);
+        Some(Candidate { class: d.class, score: d.score, corners, level: 0, location })
+    };
+    let candidates = all.iter().enumerate().filter_map(candidate).collect();
+    let kept = suppress(candidates, options.overlap, options.per_class, options.max_detections);
+    kept.iter().filter_map(|c| all[c.location].take()).collect()
 }
 
 /// A candidate's mask in the image: the sum of prototypes within its box, one block of prototype pixels wider.

@@ -2,7 +2,7 @@
 
 use crate::anchored::{AnchoredDetection, AnchoredKind, AnchoredNetwork, Thresholds};
 use crate::card::{anchored_kind, classes_of, read_anchored};
-use crate::detect::{DetectOptions, Detected, NetworkImage, Numbers, decode};
+use crate::detect::{DetectOptions, Detected, NetworkImage, Numbers, decode, merged};
 use crate::network::{Detector, DetectorConfig, EncoderKind};
 use crate::torchvision::{self, Torchvision};
 use burn::module::Module;
@@ -14,6 +14,7 @@ use sixfold_nn::weights::{
     ModelCard, WeightsError, load_weights, load_weights_from_bytes, read_card, save_weights,
     write_card_markdown,
 };
+use std::f32::consts::SQRT_2;
 use std::path::{Path, PathBuf};
 
 /// The weights of the detector of any object; their card is next to them.
@@ -343,10 +344,16 @@ impl DetectorModel {
         options.check().map_err(ModelError::Option)?;
         match &self.network {
             Network::Anchorless(network) => {
-                let longest_side = self.usage.longest_side;
-                let input =
-                    NetworkImage::new(image, &network.config, longest_side).ok_or(ModelError::EmptyImage)?;
-                Ok(decode(&network.run(&input), &input, image.size(), &network.config, options))
+                let (width, height) = image.size();
+                let longest = self.usage.longest_side.min(width.max(height)) as f32;
+                let mut found = Vec::new();
+                for scale in 0..options.scales {
+                    let side = (longest * SQRT_2.powi(-(scale as i32))).round() as usize;
+                    let input =
+                        NetworkImage::new(image, &network.config, side).ok_or(ModelError::EmptyImage)?;
+                    found.push(decode(&network.run(&input), &input, image.size(), &network.config, options));
+                }
+                Ok(merged(found, options))
             }
             Network::Anchored(..) if image.size().0 == 0 || image.size().1 == 0 => {
                 Err(ModelError::EmptyImage)
@@ -364,7 +371,7 @@ fn anchored(
     image: &RgbImage,
     options: &DetectOptions,
 ) -> Vec<Detected> {
-    let DetectOptions { threshold, overlap, per_class, max_detections, masks } = *options;
+    let DetectOptions { threshold, overlap, per_class, max_detections, masks, scales: _ } = *options;
     let thresholds = Thresholds {
         score: threshold,
         overlap: f64::from(overlap),

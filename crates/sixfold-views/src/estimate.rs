@@ -11,10 +11,11 @@ use sixfold_nn::xfeat::{CELL, MULTIPLE};
 use sixfold_render::VisibilityBuffer;
 use sixfold_synth::augment::Patch;
 
+use crate::colour::{Chroma, chromas, grey};
 use crate::crop::Crop;
 use crate::error::ViewsError;
 use crate::features::{Extractor, FeatureMap};
-use crate::matching::{Match, best_near, dot, mutual_matches, similarity};
+use crate::matching::{Match, best_near, colour_similarity, dot, mutual_matches, similarity};
 use crate::network::input;
 use crate::refiner::{Refiner, Target};
 use crate::templates::{CROP_FACTOR, Template, cells_on_object, gathered, input_over_grey, render};
@@ -36,6 +37,8 @@ pub struct ViewsOptions {
     pub hypotheses: usize,
     /// Iterations of rendering, comparing and updating each pose.
     pub refinements: usize,
+    /// Weight of the similarity of colours when proposals are compared with templates.
+    pub place_colour: f32,
     /// Search distance of a rendered feature in these iterations, cells.
     pub refine_reach: usize,
     /// Number of poses that are refined once more in a crop around the whole object.
@@ -66,12 +69,13 @@ impl Default for ViewsOptions {
             reprojection: 4.0,
             hypotheses: 12,
             refinements: 4,
+            place_colour: std::env::var("PC").map_or(0.5, |v| v.parse().unwrap()),
             refine_reach: 3,
             close: 4,
             close_side: 224,
             outline: true,
-            proposals: 100,
-            places: 4,
+            proposals: 200,
+            places: std::env::var("PL").map_or(4, |v| v.parse().unwrap()),
             seed: 0,
         }
     }
@@ -155,7 +159,7 @@ impl Views<'_> {
             return Ok(None);
         };
         let ranked = self.ranked(&part);
-        let mut hypotheses = self.coarse(&part, &ranked)?;
+        let mut hypotheses = self.coarse(&part, &ranked, self.options.hypotheses)?;
         let close = self.options.close.min(hypotheses.len());
         let closer =
             self.closer_all(hypotheses[..close].iter().map(|h| (*h, *bbox)).collect(), image, camera)?;
@@ -174,14 +178,13 @@ impl Views<'_> {
     }
 
     /// Poses from a crop and the templates most similar to it, best first.
-    pub(crate) fn coarse(&self, part: &Part, ranked: &[(usize, f32)]) -> Result<Vec<Hypothesis>, ViewsError> {
-        let options = self.options;
+    pub(crate) fn coarse(&self, part: &Part, ranked: &[(usize, f32)], hypotheses: usize) -> Result<Vec<Hypothesis>, ViewsError> {
         let mut first: Vec<Hypothesis> =
             ranked.par_iter().filter_map(|(i, _)| self.pose_by(&self.templates[*i], part)).collect();
         first.sort_by(|a, b| b.inliers.cmp(&a.inliers).then(b.similarity.total_cmp(&a.similarity)));
         let mut kept: Vec<Hypothesis> = Vec::new();
         for hypothesis in first {
-            if kept.len() < options.hypotheses && kept.iter().all(|k| !self.same(k, &hypothesis)) {
+            if kept.len() < hypotheses && kept.iter().all(|k| !self.same(k, &hypothesis)) {
                 kept.push(hypothesis);
             }
         }
@@ -438,6 +441,8 @@ pub(crate) struct Part {
     patch: Patch,
     input: Vec<f32>,
     pub(crate) map: FeatureMap,
+    /// Colours of the cells; `None` if the image is grey.
+    pub(crate) chromas: Option<Vec<Chroma>>,
 }
 
 impl Part {
@@ -453,7 +458,13 @@ impl Part {
         let patch = crop.cut(image, camera, [0.5; 3]);
         let input = input(&patch.data);
         let maps = extractor.features(std::slice::from_ref(&input), side)?;
-        Ok(maps.into_iter().next().map(|map| Part { crop, patch, input, map }))
+        let chromas = Some(chromas(&patch.data, side, |_| true)).filter(|chromas| !grey(chromas));
+        Ok(maps.into_iter().next().map(|map| Part { crop, patch, input, map, chromas }))
+    }
+
+    /// Similarity of its colours to a template's, 0 to 1; 0 if either has none.
+    pub(crate) fn colour_of(&self, template: &Template) -> f32 {
+        self.chromas.as_ref().map_or(0.0, |chromas| colour_similarity(template, chromas))
     }
 
     fn target(&self) -> Target<'_> {

@@ -12,10 +12,10 @@ use sixfold_nn::xfeat::CHANNELS;
 use crate::templates::Template;
 
 /// Magic bytes of such a file; the digit is the format's version.
-const MAGIC: &[u8; 8] = b"sfviews1";
-/// Bytes of a template without its cells: pose, focal length, side, number of cells.
-const HEAD: usize = 8 * 8 + 2 * 4;
-/// Bytes of a cell: number, feature, point.
+const MAGIC: &[u8; 8] = b"sfviews2";
+/// Bytes of a template without its cells: pose, focal length, side, number of cells, number of cells with a colour (all or none).
+const HEAD: usize = 8 * 8 + 3 * 4;
+/// Bytes of a cell without its colour: number, feature, point.
 const PER_CELL: usize = 2 + 2 * CHANNELS + 3 * 4;
 
 /// Writes templates; `key` is the hash of their inputs.
@@ -31,9 +31,12 @@ pub(crate) fn write(path: &Path, key: u64, templates: &[Template]) -> io::Result
         numbers.for_each(|v| out.extend_from_slice(&v.to_le_bytes()));
         out.extend_from_slice(&(template.camera.width as u32).to_le_bytes());
         out.extend_from_slice(&(template.cells.len() as u32).to_le_bytes());
+        out.extend_from_slice(&(template.chromas.len() as u32).to_le_bytes());
         template.cells.iter().for_each(|c| out.extend_from_slice(&c.to_le_bytes()));
         template.features.iter().for_each(|v| out.extend_from_slice(&f16::from_f32(*v).to_le_bytes()));
         template.points.as_flattened().iter().for_each(|v| out.extend_from_slice(&v.to_le_bytes()));
+        let chromas = template.chromas.as_flattened().iter();
+        chromas.for_each(|v| out.extend_from_slice(&f16::from_f32(*v).to_le_bytes()));
     }
     let sum = fnv1a(&out);
     out.extend_from_slice(&sum.to_le_bytes());
@@ -86,6 +89,10 @@ impl Reader<'_> {
         Some(f32::from_le_bytes(self.take()?)).filter(|v| v.is_finite())
     }
 
+    fn half(&mut self) -> Option<f32> {
+        Some(f16::from_le_bytes(self.take()?).to_f32()).filter(|v| v.is_finite())
+    }
+
     fn template(&mut self) -> Option<Template> {
         let mut numbers = [0.0; 8];
         for value in &mut numbers {
@@ -95,7 +102,8 @@ impl Reader<'_> {
         let rotation = UnitQuaternion::try_new(Quaternion::new(w, i, j, k), 1e-6)?;
         let side = u32::from_le_bytes(self.take()?) as usize;
         let count = u32::from_le_bytes(self.take()?) as usize;
-        if count > self.0.len() / PER_CELL || side > MAX_SIDE {
+        let coloured = u32::from_le_bytes(self.take()?) as usize;
+        if count > self.0.len() / PER_CELL || side > MAX_SIDE || (coloured != 0 && coloured != count) {
             return None;
         }
         let centre = 0.5 * (side as f64 - 1.0);
@@ -107,6 +115,7 @@ impl Reader<'_> {
             cells: Vec::with_capacity(count),
             features: Vec::with_capacity(count * CHANNELS),
             points: Vec::with_capacity(count),
+            chromas: Vec::with_capacity(coloured),
         };
         for _ in 0..count {
             let cell = u16::from_le_bytes(self.take()?);
@@ -116,11 +125,13 @@ impl Reader<'_> {
             template.cells.push(cell);
         }
         for _ in 0..count * CHANNELS {
-            let value = f16::from_le_bytes(self.take()?).to_f32();
-            template.features.push(Some(value).filter(|v| v.is_finite())?);
+            template.features.push(self.half()?);
         }
         for _ in 0..count {
             template.points.push([self.single()?, self.single()?, self.single()?]);
+        }
+        for _ in 0..coloured {
+            template.chromas.push([self.half()?, self.half()?]);
         }
         Some(template)
     }
@@ -133,13 +144,14 @@ const MAX_SIDE: usize = 2048;
 mod tests {
     use super::*;
 
-    fn template(count: usize) -> Template {
+    fn template(count: usize, coloured: bool) -> Template {
         Template {
             crop_from_object: Pose::exp(&[0.1, 0.2, 0.9, 0.3, -0.4, 0.5].into()),
             camera: Camera::new(500.0, 500.0, 79.5, 79.5, 160, 160).unwrap(),
             cells: (0..count as u16).map(|c| 3 * c).collect(),
             features: (0..count * CHANNELS).map(|i| (i % 16) as f32 / 16.0).collect(),
             points: (0..count).map(|i| [i as f32, 0.5, -0.25]).collect(),
+            chromas: (0..count * usize::from(coloured)).map(|i| [0.25, -0.5 * i as f32]).collect(),
         }
     }
 
@@ -148,15 +160,16 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("views.bin");
         assert!(read(&file, 7).unwrap().is_none(), "no file");
-        let templates = [template(5), template(0)];
+        let templates = [template(5, true), template(0, false), template(3, false)];
         write(&file, 7, &templates).unwrap();
         let back = read(&file, 7).unwrap().unwrap();
-        assert_eq!(back.len(), 2);
+        assert_eq!(back.len(), 3);
         for (back, template) in back.iter().zip(&templates) {
             assert!(back.crop_from_object.distance_to(&template.crop_from_object) < 1e-12);
             assert!(back.crop_from_object.rotation_angle_to(&template.crop_from_object) < 1e-7);
             assert_eq!((back.camera, &back.cells), (template.camera, &template.cells));
             assert_eq!((&back.features, &back.points), (&template.features, &template.points));
+            assert_eq!(back.chromas, template.chromas);
         }
         assert!(read(&file, 8).unwrap().is_none(), "of another object");
         let whole = std::fs::read(&file).unwrap();

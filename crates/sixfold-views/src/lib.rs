@@ -11,6 +11,7 @@
 #![deny(clippy::print_stdout, clippy::print_stderr)]
 #![warn(unreachable_pub, unnameable_types)]
 
+mod colour;
 mod crop;
 mod error;
 mod estimate;

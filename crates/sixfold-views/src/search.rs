@@ -72,7 +72,7 @@ impl Views<'_> {
         alike.truncate(self.options.places.saturating_add(instances - 1));
         let mut pool: Vec<(usize, Hypothesis)> = Vec::new();
         for (number, (place, _)) in alike.iter().enumerate() {
-            let poses = self.coarse(&place.part, &self.ranked(&place.part))?;
+            let poses = self.coarse(&place.part, &self.ranked(&place.part), std::env::var("HY").map_or(self.options.hypotheses, |v| v.parse().unwrap()))?;
             pool.extend(poses.into_iter().map(|pose| (number, pose)));
         }
         pool.sort_by(|a, b| b.1.similarity.total_cmp(&a.1.similarity));
@@ -97,7 +97,8 @@ impl Views<'_> {
 
     /// Similarity of a crop to its most similar template, on a subset of features: selects the places to examine further.
     fn max_similarity(&self, part: &Part) -> f32 {
-        let of = |template| quick_similarity(template, &part.map);
+        let weight = self.options.place_colour;
+        let of = |template| quick_similarity(template, &part.map) + weight * part.colour_of(template);
         self.templates.par_iter().map(of).reduce(|| f32::NEG_INFINITY, f32::max)
     }
 

@@ -11,6 +11,7 @@ use sixfold_nn::xfeat::{CELL, CHANNELS, MULTIPLE};
 use sixfold_render::{Light, Material, RenderOptions, SceneObject, VisibilityBuffer, shade};
 use sixfold_synth::augment::Patch;
 
+use crate::colour::{Chroma, chromas, has_colours};
 use crate::crop::Crop;
 use crate::error::ViewsError;
 use crate::features::{Extractor, FeatureMap};
@@ -29,6 +30,8 @@ pub(crate) struct Template {
     pub features: Vec<f32>,
     /// Their points in the object's frame, metres.
     pub points: Vec<[f32; 3]>,
+    /// Their colours; none if the object has no colours.
+    pub chromas: Vec<Chroma>,
 }
 
 impl Template {
@@ -241,7 +244,8 @@ pub(crate) fn make_templates(
         for (template, map) in made.iter_mut().zip(maps) {
             template.features = gathered(&map, &template.cells);
             // Rounded as in the file, so that stored and new templates give the same poses.
-            template.features.iter_mut().for_each(|v| *v = f16::from_f32(*v).to_f32());
+            let numbers = template.features.iter_mut().chain(template.chromas.as_flattened_mut());
+            numbers.for_each(|v| *v = f16::from_f32(*v).to_f32());
         }
         templates.append(&mut made);
     }
@@ -273,7 +277,21 @@ fn render_side(
     let rendered = render(close, mesh, &crop_from_object, None);
     let (cells, points) = cells_on_object(&rendered, options.side / CELL);
     let input = input_over_grey(&rendered);
-    Some((Template { crop_from_object, camera: crop.camera, cells, features: vec![], points }, input))
+    let mut colours = Vec::new();
+    if has_colours(mesh) {
+        let shown = |i: usize| !rendered.coordinates.as_slice()[i][0].is_nan();
+        let all = chromas(&Patch::from_rgb(&rendered.image).data, options.side, shown);
+        colours = cells.iter().map(|cell| all[usize::from(*cell)]).collect();
+    }
+    let template = Template {
+        crop_from_object,
+        camera: crop.camera,
+        cells,
+        features: vec![],
+        points,
+        chromas: colours,
+    };
+    Some((template, input))
 }
 
 /// The features of some cells.

@@ -513,6 +513,7 @@ class Detector:
         overlap: float = 0.5,
         per_object: int = 100,
         max_detections: int = 100,
+        scales: int = 1,
         masks: bool = True,
     ) -> list[DetectedObject]: ...
 

@@ -9,7 +9,6 @@ use serde::Serialize;
 use sixfold_bop::{BopDataset, Detection, write_detections};
 use sixfold_detect::detect::DetectOptions;
 use sixfold_detect::detector::TrainedDetector;
-use sixfold_detect::model::DetectorModel;
 use sixfold_detect::torchvision::existing_objects_file;
 use sixfold_geometry::RgbImage;
 use sixfold_io::read_rgb;
@@ -54,23 +53,28 @@ pub(crate) fn run(a: &DetectArguments) -> Result<Outcome> {
     without_duplicates("--ids", &a.ids)?;
     // The weights are hashed before they are read, so that a change in between is noticed.
     let of_run = run_options(a);
-    let model = DetectorModel::load(&a.weights)?;
+    let detector = match &a.weights {
+        Some(weights) => TrainedDetector::load(weights)?,
+        None => TrainedDetector::proposals().context("the detector within the program")?,
+    };
     for id in &a.ids {
-        model.check_object(*id).with_context(|| "--ids".to_string())?;
+        detector.model().check_object(*id).with_context(|| "--ids".to_string())?;
     }
+    let own = detector.options();
     let default = match a.dataset {
         Some(_) => DetectOptions::for_scores().threshold,
-        None => model.usage().threshold,
+        None => own.threshold,
     };
     let options = DetectOptions {
         threshold: a.threshold.unwrap_or(default),
-        overlap: a.overlap,
-        per_class: a.per_object,
-        max_detections: a.max_detections,
+        overlap: a.overlap.unwrap_or(own.overlap),
+        per_class: a.per_object.unwrap_or(own.per_class),
+        max_detections: a.max_detections.unwrap_or(own.max_detections),
+        scales: a.scales.unwrap_or(own.scales),
         masks: !a.no_masks,
     };
     options.check().map_err(|message| anyhow!(message))?;
-    let detector = TrainedDetector::new(model, options);
+    let detector = detector.with_options(options);
     match (&a.dataset, &a.rgb[..]) {
         (Some(root), _) => in_dataset(a, &detector, root, &of_run),
         (None, [file]) => in_image(a, &detector, file),
@@ -91,6 +95,7 @@ fn run_options(a: &DetectArguments) -> RunOptions {
         overlap,
         per_object,
         max_detections,
+        scales,
         no_masks,
         rgb: _,
         targets: _,
@@ -100,17 +105,19 @@ fn run_options(a: &DetectArguments) -> RunOptions {
         json: _,
     } = a;
     let mut options = RunOptions::default();
-    options.add("weights", &weights.to_string_lossy());
-    if let Some(file) = existing_objects_file(weights) {
+    let weights = weights.as_deref();
+    options.add("weights", &weights.map_or("any object".into(), Path::to_string_lossy));
+    if let Some(file) = weights.and_then(existing_objects_file) {
         options.add("objects of the weights", &file.to_string_lossy());
     }
     options.add("dataset", &dataset.as_deref().map_or_else(String::new, |d| d.to_string_lossy().into()));
     options.add("split", split);
     options.add("ids", &format!("{ids:?}"));
     options.add("threshold", &format!("{threshold:?}"));
-    options.add("overlap", &overlap.to_string());
-    options.add("per-object", &per_object.to_string());
-    options.add("max_detections", &max_detections.to_string());
+    options.add("overlap", &format!("{overlap:?}"));
+    options.add("per-object", &format!("{per_object:?}"));
+    options.add("max_detections", &format!("{max_detections:?}"));
+    options.add("scales", &format!("{scales:?}"));
     options.add("no-masks", &no_masks.to_string());
     options
 }

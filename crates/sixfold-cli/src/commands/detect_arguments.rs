@@ -9,9 +9,9 @@ use sixfold_shell::output::JsonArguments;
 pub(crate) struct DetectArguments {
     /// Trained detector: a file that `sixfold train detector` wrote, or torchvision's weights of Faster R-CNN, Mask R-CNN or
     /// RetinaNet on ResNet-50 with a pyramid (.pth, .pt or .safetensors; a file NAME.objects.json beside them maps labels to
-    /// objects)
+    /// objects). Without it, a detector of any object, which comes with the program, proposes boxes
     #[arg(long, value_name = "FILE")]
-    pub weights: PathBuf,
+    pub weights: Option<PathBuf>,
     /// Colour images: PNG or JPEG of any size, grey or colour
     #[arg(long, value_name = "FILE", num_args = 1.., required_unless_present = "dataset", conflicts_with = "dataset")]
     pub rgb: Vec<PathBuf>,
@@ -40,15 +40,19 @@ pub(crate) struct DetectArguments {
     /// low scores)
     #[arg(long, value_name = "SCORE")]
     pub threshold: Option<f32>,
-    /// If two boxes of an object overlap more than this (intersection over union), keep only the better one
-    #[arg(long, value_name = "FRACTION", default_value = "0.5")]
-    pub overlap: f32,
-    /// Maximum number of detections per object in an image
-    #[arg(long, value_name = "N", default_value = "100")]
-    pub per_object: usize,
-    /// Maximum number of detections in an image
-    #[arg(long, value_name = "N", default_value = "100")]
-    pub max_detections: usize,
+    /// If two boxes of an object overlap more than this (intersection over union), keep only the better one (default: 0.5; 0.6
+    /// without --weights)
+    #[arg(long, value_name = "FRACTION")]
+    pub overlap: Option<f32>,
+    /// Maximum number of detections per object in an image (default: 100; 200 without --weights)
+    #[arg(long, value_name = "N")]
+    pub per_object: Option<usize>,
+    /// Maximum number of detections in an image (default: 100; 200 without --weights)
+    #[arg(long, value_name = "N")]
+    pub max_detections: Option<usize>,
+    /// Number of sizes at which an image is processed, each smaller by the square root of two (default: 1; 3 without --weights)
+    #[arg(long, value_name = "N")]
+    pub scales: Option<usize>,
     /// Boxes only
     #[arg(long)]
     pub no_masks: bool,
