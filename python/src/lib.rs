@@ -21,7 +21,6 @@ mod experienced;
 mod grasp;
 mod gripper;
 mod guard;
-mod made_up;
 mod mesh;
 mod methods;
 mod metrics;
@@ -34,6 +33,7 @@ mod recipes;
 mod render;
 mod scene;
 mod scene_writer;
+mod synthetic;
 mod training;
 mod trial;
 
@@ -122,8 +122,8 @@ fn _sixfold(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(recipes::train_refiner, module)?)?;
     module.add_function(wrap_pyfunction!(recipes::train_proposals, module)?)?;
     module.add_function(wrap_pyfunction!(mttm::estimate_mttm, module)?)?;
-    module.add_function(wrap_pyfunction!(made_up::made_up_mesh, module)?)?;
-    module.add_function(wrap_pyfunction!(made_up::drop_objects, module)?)?;
+    module.add_function(wrap_pyfunction!(synthetic::synthetic_mesh, module)?)?;
+    module.add_function(wrap_pyfunction!(synthetic::drop_objects, module)?)?;
     module.add_function(wrap_pyfunction!(trial::gripper_pose, module)?)?;
     module.add_function(wrap_pyfunction!(trial::try_grasp, module)?)?;
     module.add_function(wrap_pyfunction!(grasp::find_objects, module)?)?;

@@ -160,7 +160,7 @@ pub(crate) fn make(py: Python<'_>, method: &str, options: &Options) -> PyResult<
             let mut estimator = read.map_err(|error| file_or_value(&error))?;
             estimator.options.estimate.seed = options.seed;
             if let Some(passes) = options.passes {
-                estimator.options.looks = passes;
+                estimator.options.passes = passes;
             }
             estimator.refine = options.refine;
             let refiner = interruptible(py, |_| ViewsRefiner::shipped())?.map_err(|e| file_or_value(&e))?;

@@ -65,8 +65,8 @@ impl RefinedPoses {
 
     /// Angle by which the object was rotated, (N,) float64, radians.
     #[getter]
-    fn turned<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
-        self.numbers(py, |s| s.turned)
+    fn rotated<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f64>> {
+        self.numbers(py, |s| s.rotated)
     }
 
     /// Mean difference in colour from the other photographs, before and after the refinement, (N, 2) float64, 0 to 1. NaN if

@@ -207,7 +207,7 @@ impl Pix2Pose {
     /// thresholds: thresholds on the expected error, instead of the model's.
     /// two_stages: False uses the poses of the first pass.
     /// refine: False skips the alignment of the outline and the refinement.
-    /// looks: maximum number of passes over an object with a mesh. Each pass after the first uses the box of the previous pose.
+    /// passes: maximum number of passes over an object with a mesh. Each pass after the first uses the box of the previous pose.
     ///     This helps with inaccurate boxes.
     /// correct: False skips the correction of aligned poses by the model's systematic error, which was measured on the training
     ///     photographs.
@@ -217,7 +217,7 @@ impl Pix2Pose {
     ///
     /// Raises ValueError for an unknown object, a box without area or outside the image, an image of another size than the
     /// camera's, and depth without meshes.
-    #[pyo3(signature = (rgb, boxes, object_ids=None, *, camera=None, meshes=None, depth=None, thresholds=None, two_stages=true, refine=true, looks=1, correct=true, crop_factor=1.5, seed=0))]
+    #[pyo3(signature = (rgb, boxes, object_ids=None, *, camera=None, meshes=None, depth=None, thresholds=None, two_stages=true, refine=true, passes=1, correct=true, crop_factor=1.5, seed=0))]
     #[allow(clippy::too_many_arguments)]
     fn __call__(
         &self,
@@ -231,7 +231,7 @@ impl Pix2Pose {
         thresholds: Option<&Bound<'_, PyAny>>,
         two_stages: bool,
         refine: bool,
-        looks: i64,
+        passes: i64,
         correct: bool,
         crop_factor: f64,
         seed: i64,
@@ -285,7 +285,7 @@ impl Pix2Pose {
         };
         let options = AlignOptions {
             estimate: options,
-            looks: arrays::whole("looks", looks, 1)?,
+            passes: arrays::whole("passes", passes, 1)?,
             correct,
             ..AlignOptions::default()
         };

@@ -18,7 +18,7 @@ pub(crate) const IDLE: &[Idle] = &[
     Idle { command: "eval", options: &["min_score"], when: &[Without("detections")] },
     Idle { command: "eval", options: &["detection_ap", "no_vsd", "curves"], when: &[With("detections")] },
     Idle { command: "object add", options: &["model_id"], when: &[Without("models_info")] },
-    Idle { command: "object add", options: &["unit", "models_info", "model_id", "turns_about"], when: &[With("depth")] },
+    Idle { command: "object add", options: &["unit", "models_info", "model_id", "symmetric_about"], when: &[With("depth")] },
     Idle { command: "synthesize", options: &["split"], when: &[Without("dataset")] },
     Idle { command: "synthesize", options: &["rough", "scene"], when: &[With("no_refine")] },
     Idle { command: "simulate-scenes", options: &["unit", "store"], when: &[Without("objects")] },

@@ -33,7 +33,14 @@ pub struct DetectOptions {
 impl Default for DetectOptions {
     /// For display and for poses: only confident detections.
     fn default() -> Self {
-        DetectOptions { threshold: 0.4, overlap: 0.5, per_class: 100, max_detections: 100, scales: 1, masks: true }
+        DetectOptions {
+            threshold: 0.4,
+            overlap: 0.5,
+            per_class: 100,
+            max_detections: 100,
+            scales: 1,
+            masks: true,
+        }
     }
 }
 
@@ -335,6 +342,29 @@ mod tests {
         assert_eq!(scores(suppress(all.clone(), 0.5, 1, 9)), [0.9, 0.4]);
         assert_eq!(scores(suppress(all.clone(), 0.5, 9, 1)), [0.9]);
         assert_eq!(scores(suppress(all, 0.9, 9, 9)), [0.9, 0.6, 0.5, 0.4]);
+    }
+
+    #[test]
+    fn detections_of_several_scales_are_suppressed_as_those_of_one() {
+        let found = |score: f32, x: f64| Detected {
+            class: 0,
+            score,
+            bbox: Rect { x, y: 0.0, width: 10.0, height: 10.0 },
+            mask: Some(Mask::filled(1, 1, score > 0.6)),
+        };
+        let scales = vec![vec![found(0.9, 0.0), found(0.5, 30.0)], vec![found(0.7, 1.0), found(0.6, 60.0)]];
+        let options = DetectOptions::default();
+        let merged_with = |options: &DetectOptions| merged(scales.clone(), options);
+        let all = merged_with(&options);
+        assert_eq!(all.iter().map(|d| d.score).collect::<Vec<_>>(), [0.9, 0.6, 0.5]);
+        assert!(all[0].mask.as_ref().unwrap()[(0, 0)] && !all[1].mask.as_ref().unwrap()[(0, 0)]);
+        assert_eq!(merged_with(&DetectOptions { max_detections: 2, ..options }).len(), 2);
+        assert_eq!(merged_with(&DetectOptions { overlap: 0.9, ..options }).len(), 4);
+        assert_eq!(merged(vec![scales[0].clone()], &options), scales[0]);
+        for scales in [0, MAX_SCALES + 1] {
+            let message = DetectOptions { scales, ..options }.check().unwrap_err();
+            assert!(message.contains("scales") && message.contains("1 to 7"), "{message}");
+        }
     }
 
     #[test]

@@ -71,7 +71,7 @@ pub struct PoseRecord {
     /// Distance by which the object's centre moved, millimetres.
     pub moved_mm: f64,
     /// Angle by which it was rotated, degrees.
-    pub turned_degrees: f64,
+    pub rotated_degrees: f64,
     /// Mean difference in colour to the other images of the object, 0 to 1, before and after.
     pub difference: [Option<f64>; 2],
     /// Why the image is not used.
@@ -129,7 +129,7 @@ impl PoseFile {
             undisturbed: disturbed.then(|| rows(&image.given)),
             camera_from_object: rows(image.posed.camera_from_object()),
             moved_mm: 0.0,
-            turned_degrees: 0.0,
+            rotated_degrees: 0.0,
             difference: [None, None],
             dropped: None,
         };
@@ -200,7 +200,7 @@ impl PoseFile {
                     let moved = pose.transform_point(&centre) - given.transform_point(&centre);
                     record.camera_from_object = rows(pose);
                     record.moved_mm = 1e3 * moved.norm();
-                    record.turned_degrees = pose.rotation_angle_to(given).to_degrees();
+                    record.rotated_degrees = pose.rotation_angle_to(given).to_degrees();
                 }
             }
             poses.write(file)?;
@@ -237,7 +237,7 @@ impl PoseFile {
         for (record, report) in self.photographs.iter_mut().zip(&refined.sources) {
             record.camera_from_object = rows(&report.camera_from_object);
             record.moved_mm = report.moved * 1e3;
-            record.turned_degrees = report.turned.to_degrees();
+            record.rotated_degrees = report.rotated.to_degrees();
             record.difference = report.difference.map(|d| d.is_finite().then_some(d));
             record.dropped.clone_from(&report.dropped);
         }

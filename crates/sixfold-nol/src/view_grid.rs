@@ -23,7 +23,7 @@ pub struct ViewGrid {
     /// Lowest and highest elevation above the object's xy plane, degrees.
     pub elevation: [f64; 2],
     /// Images of each view, each with its own in-plane rotation (up to 45 degrees).
-    pub turns: usize,
+    pub rotations: usize,
     /// Side of the images, pixels.
     pub size: usize,
     /// Seed of rotations and distances.
@@ -60,10 +60,10 @@ impl ViewGrid {
         let (low, high) = (self.elevation[0].to_radians(), self.elevation[1].to_radians());
         let around = (TAU / step).round().max(1.0) as usize;
         let up = ((high - low) / step + 1e-9).floor() as usize + 1;
-        let mut aims = Vec::with_capacity(around * up * self.turns);
+        let mut aims = Vec::with_capacity(around * up * self.rotations);
         for e in 0..up {
             for z in 0..around {
-                for turn in 0..self.turns {
+                for turn in 0..self.rotations {
                     let (azimuth, elevation) = (TAU * z as f64 / around as f64, low + e as f64 * step);
                     aims.push(Aim { azimuth, elevation, turn });
                 }
@@ -88,10 +88,10 @@ impl ViewGrid {
         let range = distances.fold([f64::INFINITY, 0.0f64], |[low, high], d| [low.min(d), high.max(d)]);
         let distance = f64::from(uniform(&mut random, [range[0] as f32, range[1] as f32]));
         // The in-plane rotations of one view are spread evenly between -45 and 45 degrees; a single one is random in this range.
-        let roll = if self.turns == 1 {
+        let roll = if self.rotations == 1 {
             f64::from(uniform(&mut random, [-1.0, 1.0])) * FRAC_PI_4
         } else {
-            (2.0 * aim.turn as f64 / (self.turns - 1) as f64 - 1.0) * FRAC_PI_4
+            (2.0 * aim.turn as f64 / (self.rotations - 1) as f64 - 1.0) * FRAC_PI_4
         };
         let pose = looking_at(&centre, aim, distance, roll);
         let camera = *photographs.first()?.camera();

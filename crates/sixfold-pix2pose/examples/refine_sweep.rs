@@ -1,4 +1,4 @@
-//! Options of the outline alignment one by one on estimated poses: DATASET TARGETS.json WEIGHTS [looks: only how often is looked].
+//! Options of the outline alignment one by one on estimated poses: DATASET TARGETS.json WEIGHTS [passes: only how often is looked].
 //!
 //! Prints the recall of ADD(-S) below a tenth of the diameter, and the median error along the view axis.
 use rayon::prelude::*;
@@ -116,11 +116,11 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         cases.iter().map(|c| measured(c, &c.found.hypotheses[0].camera_from_object)).collect();
     println!("{} cases", cases.len());
     print("PnP", &before);
-    for (looks, shape, line) in
+    for (passes, shape, line) in
         [(1, 30.0, 0.3), (2, 30.0, 0.3), (3, 30.0, 0.3), (2, 10.0, 0.3), (3, 10.0, 0.3), (2, 15.0, 0.5)]
     {
         let options = AlignOptions {
-            looks,
+            passes,
             refine: OutlineRefinementOptions { shape, line, ..base.clone() },
             ..AlignOptions::default()
         };
@@ -134,7 +134,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
                 measured(c, &pose)
             })
             .collect();
-        print(&format!("looks {looks} shape {shape} line {line}"), &errors);
+        print(&format!("passes {passes} shape {shape} line {line}"), &errors);
     }
     if arguments.len() > 3 {
         return Ok(());

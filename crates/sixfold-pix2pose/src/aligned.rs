@@ -25,7 +25,7 @@ pub struct AlignOptions {
     pub refine: OutlineRefinementOptions,
     /// Maximum number of iterations: each after the first uses the box of the previous pose; they stop when the box does not
     /// change.
-    pub looks: usize,
+    pub passes: usize,
     /// Weight of the refiner's pose, 0 to 1, in the final one; the rest is that of the aligned outline. Their errors are different,
     /// so that a mean is nearer than either. 0: the refiner is not used. Chosen by ADD(-S)
     /// recall on 602 targets of 84 LM-O development frames, ground-truth boxes: with 0, 0.3, 0.5, 0.7, 1 .518, .533, .515, .512, .497.
@@ -39,7 +39,7 @@ impl Default for AlignOptions {
         Self {
             estimate: Pix2PoseOptions::default(),
             refine: OutlineRefinementOptions::default(),
-            looks: 1,
+            passes: 1,
             refiner_weight: 0.3,
             correct: true,
         }
@@ -51,7 +51,7 @@ impl AlignOptions {
     pub fn published() -> AlignOptions {
         AlignOptions {
             estimate: Pix2PoseOptions::published(),
-            looks: 1,
+            passes: 1,
             correct: false,
             ..AlignOptions::default()
         }
@@ -65,7 +65,7 @@ impl AlignOptions {
         self.estimate.check()?;
         self.refine.check()?;
         OptionError::unless_fraction("refiner_weight", self.refiner_weight)?;
-        OptionError::unless_some("looks", self.looks)
+        OptionError::unless_some("passes", self.passes)
     }
 }
 
@@ -119,7 +119,7 @@ pub fn estimate_aligned(
     };
     let Some(mut best) = run_pass(region)? else { return Ok(None) };
     let mut last_box = *region;
-    for _ in 1..options.looks.max(1) {
+    for _ in 1..options.passes.max(1) {
         let Some(whole) = projected_box(mesh, camera, &best.camera_from_object) else { break };
         if !best.improved || !alike(&whole, region) || same(&whole, &last_box) {
             break;
@@ -294,7 +294,7 @@ mod tests {
         let options = AlignOptions::default();
         assert_eq!(options.check(), Ok(()));
         let named = |options: AlignOptions| options.check().unwrap_err().option;
-        assert_eq!(named(AlignOptions { looks: 0, ..options.clone() }), "looks");
+        assert_eq!(named(AlignOptions { passes: 0, ..options.clone() }), "passes");
         assert_eq!(named(AlignOptions { refiner_weight: 1.5, ..options.clone() }), "refiner_weight");
         let estimate = Pix2PoseOptions { thresholds: vec![0.1, f32::NAN], ..options.estimate.clone() };
         assert_eq!(named(AlignOptions { estimate, ..options.clone() }), "thresholds");

@@ -115,7 +115,7 @@ pub struct ObjectViews {
     /// Median distance by which the refinement moved the object, millimetres.
     pub median_moved_mm: f64,
     /// Median angle by which it rotated the object, degrees.
-    pub median_turned_degrees: f64,
+    pub median_rotated_degrees: f64,
 }
 
 /// Adds meshes, photographs, poses and masks to the hashes of a dataset's inputs.
@@ -258,7 +258,7 @@ impl NewViews<'_> {
             surface_unseen: maker.unseen_fraction(),
             pixels_unseen: written.unseen,
             median_moved_mm: median(of_object().map(|p| p.moved_mm)),
-            median_turned_degrees: median(of_object().map(|p| p.turned_degrees)),
+            median_rotated_degrees: median(of_object().map(|p| p.rotated_degrees)),
         };
         Ok((summary, written))
     }
@@ -274,7 +274,7 @@ impl ViewsSummary {
                 o.id,
                 o.photographs,
                 o.median_moved_mm,
-                o.median_turned_degrees,
+                o.median_rotated_degrees,
                 100.0 * o.surface_unseen,
                 o.images,
                 100.0 * o.pixels_unseen

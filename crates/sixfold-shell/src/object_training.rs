@@ -167,7 +167,7 @@ impl ObjectTraining<'_> {
     }
 
     fn grid(&self) -> ViewGrid {
-        ViewGrid { step: self.view_step, elevation: ELEVATION, turns: 1, size: SIDE, seed: 0 }
+        ViewGrid { step: self.view_step, elevation: ELEVATION, rotations: 1, size: SIDE, seed: 0 }
     }
 
     /// Makes the views that are not there yet. The poses are those of the record: the mesh was made with them.

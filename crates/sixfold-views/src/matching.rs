@@ -148,6 +148,18 @@ mod tests {
     }
 
     #[test]
+    fn colours_are_compared_cell_by_cell() {
+        let mut coloured = template(&[5, 10], &[6, 11]);
+        let mut crop = vec![[0.0; 2]; 16];
+        assert_eq!(colour_similarity(&coloured, &crop), 0.0, "an object without colours");
+        coloured.chromas = vec![[0.4, -0.2], [0.0, 0.0]];
+        let other = colour_similarity(&coloured, &crop);
+        crop[5] = [0.4, -0.2];
+        let same = colour_similarity(&coloured, &crop);
+        assert!(same == 1.0 && other < 0.8, "{same} {other}");
+    }
+
+    #[test]
     fn only_features_that_choose_each_other_match() {
         // Two features of the template match the same cell: ties go to the first.
         let found = mutual_matches(&template(&[5, 9, 10], &[6, 6, 11]), &map(), 2);

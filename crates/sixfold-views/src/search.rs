@@ -72,7 +72,7 @@ impl Views<'_> {
         alike.truncate(self.options.places.saturating_add(instances - 1));
         let mut pool: Vec<(usize, Hypothesis)> = Vec::new();
         for (number, (place, _)) in alike.iter().enumerate() {
-            let poses = self.coarse(&place.part, &self.ranked(&place.part), std::env::var("HY").map_or(self.options.hypotheses, |v| v.parse().unwrap()))?;
+            let poses = self.coarse(&place.part, &self.ranked(&place.part), self.options.place_hypotheses)?;
             pool.extend(poses.into_iter().map(|pose| (number, pose)));
         }
         pool.sort_by(|a, b| b.1.similarity.total_cmp(&a.1.similarity));

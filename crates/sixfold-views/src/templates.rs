@@ -283,14 +283,8 @@ fn render_side(
         let all = chromas(&Patch::from_rgb(&rendered.image).data, options.side, shown);
         colours = cells.iter().map(|cell| all[usize::from(*cell)]).collect();
     }
-    let template = Template {
-        crop_from_object,
-        camera: crop.camera,
-        cells,
-        features: vec![],
-        points,
-        chromas: colours,
-    };
+    let template =
+        Template { crop_from_object, camera: crop.camera, cells, features: vec![], points, chromas: colours };
     Some((template, input))
 }
 

@@ -479,7 +479,7 @@ class Pix2Pose:
         thresholds: ArrayLike | None = None,
         two_stages: bool = True,
         refine: bool = True,
-        looks: int = 1,
+        passes: int = 1,
         correct: bool = True,
         crop_factor: float = 1.5,
         seed: int = 0,
@@ -760,7 +760,7 @@ class RefinedPoses:
     @property
     def moved(self) -> Float: ...
     @property
-    def turned(self) -> Float: ...
+    def rotated(self) -> Float: ...
     @property
     def differences(self) -> Float: ...
     @property
@@ -840,7 +840,7 @@ class GraspTrial:
     def time(self) -> float: ...
     def __bool__(self) -> bool: ...
 
-def made_up_mesh(
+def synthetic_mesh(
     kind: Literal["can", "mug", "cup", "bottle", "bowl", "box", "clamp", "drill", "toy"] = "toy", *, seed: int = 0
 ) -> Mesh: ...
 def drop_objects(

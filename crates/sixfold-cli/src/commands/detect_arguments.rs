@@ -44,10 +44,10 @@ pub(crate) struct DetectArguments {
     /// without --weights)
     #[arg(long, value_name = "FRACTION")]
     pub overlap: Option<f32>,
-    /// Maximum number of detections per object in an image (default: 100; 200 without --weights)
+    /// Maximum number of detections per object in an image (default: 100; 300 without --weights)
     #[arg(long, value_name = "N")]
     pub per_object: Option<usize>,
-    /// Maximum number of detections in an image (default: 100; 200 without --weights)
+    /// Maximum number of detections in an image (default: 100; 300 without --weights)
     #[arg(long, value_name = "N")]
     pub max_detections: Option<usize>,
     /// Number of sizes at which an image is processed, each smaller by the square root of two (default: 1; 3 without --weights)

@@ -394,7 +394,7 @@ fn options_that_would_be_ignored_are_refused() {
         ("object add mug mug.ply --unit mm --model-id 3", "--model-id", "without --models-info"),
         ("object add mug ONE --mask m.png --unit mm", "--unit", "with --depth"),
         ("object add mug ONE --mask m.png --models-info i --model-id 3", "--models-info", "with --depth"),
-        ("object add mug ONE --mask m.png --turns-about z", "--turns-about", "with --depth"),
+        ("object add mug ONE --mask m.png --symmetric-about z", "--symmetric-about", "with --depth"),
         ("synthesize --photographs p.json --out out --split train", "--split", "without --dataset"),
         ("synthesize --dataset lmo --out out --no-refine --rough 3,1", "--rough", "with --no-refine"),
         ("synthesize --dataset lmo --out out --no-refine --scene still", "--scene", "with --no-refine"),

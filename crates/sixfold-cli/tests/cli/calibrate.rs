@@ -90,6 +90,48 @@ fn photographs_of_the_board_give_the_camera_and_its_poses() {
     assert_eq!(one.stdout, run.stdout);
 }
 
+/// A JPEG with EXIF data that say how the phone was held: 6 is upright, 3 upside down.
+fn with_orientation(jpeg: &[u8], orientation: u8) -> Vec<u8> {
+    // A little-endian TIFF header and one directory with one entry: tag 0x0112, a short.
+    let tiff =
+        [b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0".as_slice(), &[orientation, 0, 0, 0], &[0; 4]]
+            .concat();
+    let exif = [b"Exif\0\0".as_slice(), &tiff].concat();
+    let length = u16::try_from(exif.len() + 2).unwrap().to_be_bytes();
+    [&jpeg[..2], b"\xff\xe1", &length, &exif, &jpeg[2..]].concat()
+}
+
+#[test]
+fn however_the_phone_was_held_its_camera_is_the_same() {
+    let case = tempfile::tempdir().unwrap();
+    let [plain, held] = ["plain", "held"].map(|name| case.path().join(name));
+    write_photographs(&plain);
+    std::fs::create_dir(&held).unwrap();
+    for i in 0..7u32 {
+        let file = plain.join(format!("{i}.png"));
+        let image = read_rgb(&file).unwrap();
+        std::fs::remove_file(file).unwrap();
+        let mut jpeg = Vec::new();
+        let pixels = image.as_slice().as_flattened();
+        image::codecs::jpeg::JpegEncoder::new_with_quality(&mut jpeg, 95)
+            .encode(pixels, 640, 480, image::ExtendedColorType::Rgb8)
+            .unwrap();
+        std::fs::write(plain.join(format!("{i}.jpg")), &jpeg).unwrap();
+        let orientation = [1, 6, 3, 8][i as usize % 4];
+        std::fs::write(held.join(format!("{i}.jpg")), with_orientation(&jpeg, orientation)).unwrap();
+    }
+    let of = |folder: &str| {
+        let found =
+            sixfold(case.path(), &format!("calibrate {folder} --out out-{folder} --json")).expect(0).json();
+        let poses: Vec<_> = (0..7).map(|i| found["photographs"][i]["camera_from_board"].clone()).collect();
+        (found["camera"].clone(), poses)
+    };
+    let (camera, poses) = of("held");
+    assert_eq!((camera.clone(), poses.clone()), of("plain"));
+    assert!((camera["fx"].as_f64().unwrap() / 610.0 - 1.0).abs() < 0.005, "{camera}");
+    assert!(pose_of(&poses[1]).distance_to(&pose(1)) < 2e-3, "{}", poses[1]);
+}
+
 #[test]
 fn photographs_that_cannot_be_used_are_left_out_with_the_reason() {
     let case = tempfile::tempdir().unwrap();

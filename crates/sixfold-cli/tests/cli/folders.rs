@@ -138,7 +138,10 @@ fn counts_out_of_range_and_ids_named_twice_are_refused() {
     {
         bad("synthesize --dataset tiny --ids 8,8 --out new", &["--ids", "8 twice"]);
         bad("synthesize --dataset tiny --per-view 0 --out new", &["--per-view", "found 0", "1 to 1000"]);
-        bad("synthesize --dataset tiny --step 1 --turns 72 --out new", &["--step", "--turns", "200000"]);
+        bad(
+            "synthesize --dataset tiny --step 1 --rotations 72 --out new",
+            &["--step", "--rotations", "200000"],
+        );
         bad("detect --weights none --rgb rgb.png --ids 8,8", &["--ids", "8 twice"]);
     }
 }

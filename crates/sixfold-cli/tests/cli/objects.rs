@@ -28,7 +28,7 @@ fn objects_are_added_listed_shown_used_and_removed() {
     assert_near(&pose_of(&run.json()["poses"][0]["camera_from_object"]), &case.truth);
 
     fails(dir, "object add my-part part.ply --unit mm", &["my-part", "--replace"]);
-    sixfold(dir, "object add my-part part.ply --unit mm --turns-about z --replace").expect(0);
+    sixfold(dir, "object add my-part part.ply --unit mm --symmetric-about z --replace").expect(0);
     let shown = sixfold(dir, "object show my-part --json").expect(0).json();
     assert_eq!(shown["symmetries_continuous"].as_array().unwrap().len(), 1);
 
@@ -141,7 +141,11 @@ fn symmetries_are_not_found_twice() {
     write_box(dir);
     fails(dir, "object symmetries box.ply", &["--unit"]);
     fails(dir, "object symmetries box.ply --unit mm --noise 50", &["--noise", "50", "0 to 0.02 m"]);
-    fails(dir, "object add box box.ply --unit mm --find-symmetries --turns-about z", &["--turns-about"]);
+    fails(
+        dir,
+        "object add box box.ply --unit mm --find-symmetries --symmetric-about z",
+        &["--symmetric-about"],
+    );
     fails(dir, "object add box box.ply --unit mm --noise 1", &["--find-symmetries"]);
     // An entry with symmetries excludes other options; an entry without symmetries allows them.
     let info = tiny.file("models/models_info.json");

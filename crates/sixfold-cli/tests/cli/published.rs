@@ -91,7 +91,8 @@ fn views_are_made_as_published() {
     let poses: Value =
         serde_json::from_slice(&std::fs::read(tiny.path().join("new/poses.json")).unwrap()).unwrap();
     assert_eq!(poses["refined"], true);
-    let one = sixfold(tiny.path(), &format!("{few} --turns 1 --select surface --out one")).expect(0).json();
+    let one =
+        sixfold(tiny.path(), &format!("{few} --rotations 1 --select surface --out one")).expect(0).json();
     assert!(one["objects"].as_array().unwrap().iter().all(|o| o["images"] == 4), "{one}");
 }
 

@@ -147,7 +147,7 @@ rows! {
     object_add_views: image, ["sixfold-objects"], Some((2, "--replace")),
         "object add seen --depth depth.png --mask mask.png --camera camera.json";
     object_replace: object, ["sixfold-objects"], None,
-        "object add part part.ply --unit mm --turns-about z --templates --replace";
+        "object add part part.ply --unit mm --symmetric-about z --templates --replace";
     object_remove: object, ["sixfold-objects", "part"], Some((2, "none yet")), "object remove part";
     object_show: object, ["part.png"], None, "object show part --picture part.png";
     grasp_propose: image, ["out"], None,

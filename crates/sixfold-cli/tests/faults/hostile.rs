@@ -338,8 +338,8 @@ const TABLE: &[(&str, &str, &[&str])] = &[
     ),
     (
         "synthesize",
-        "synthesize --dataset tiny --weighting best --step 90 --turns 100000000 --out out",
-        &["--turns"],
+        "synthesize --dataset tiny --weighting best --step 90 --rotations 100000000 --out out",
+        &["--rotations"],
     ),
     ("synthesize", "synthesize --dataset tiny --weighting best --step 90 --out tiny", &["tiny"]),
     ("train_detector", "train detector --dataset tiny --ids 1,1 --out out", &["--ids", "1"]),

@@ -215,7 +215,7 @@ impl Working<'_> {
         SourceReport {
             camera_from_object: if dropped.is_some() { self.given } else { *pose },
             moved: shift * options.rough[0],
-            turned: turn * options.rough[1],
+            rotated: turn * options.rough[1],
             difference,
             lines: self.lines,
             dropped,

@@ -84,7 +84,7 @@ pub struct SourceReport {
     /// Distance by which the object's origin moved, metres.
     pub moved: f64,
     /// Angle by which it was rotated, radians.
-    pub turned: f64,
+    pub rotated: f64,
     /// Mean difference in colour to the other photographs (0 to 1) before and after.
     pub difference: [f64; 2],
     /// Lines of the outline on which the border was found at the end.

@@ -25,7 +25,7 @@ use crate::objects::SymmetryView;
 const RULE: FormRule = FormRule {
     files: &["mesh"],
     many_files: &["resource"],
-    texts: &["name", "unit", "turns_about", "find_symmetries", "noise", "replace"],
+    texts: &["name", "unit", "symmetric_about", "find_symmetries", "noise", "replace"],
 };
 
 /// The request without the files.
@@ -36,7 +36,8 @@ pub(crate) struct ObjectRequest {
     file_name: String,
     format: MeshFormat,
     unit: Unit,
-    turns_about: Option<Axis>,
+    #[serde(alias = "turns_about")]
+    symmetric_about: Option<Axis>,
     /// The evidence by which symmetries are found and stored.
     #[serde(default)]
     find_symmetries: Option<Evidence>,
@@ -78,7 +79,7 @@ pub(crate) struct ObjectForm {
     #[schema(value_type = Option<Vec<String>>, format = Binary)]
     resource: Option<Vec<Vec<u8>>>,
     /// The object looks the same however it is rotated about this axis of its own frame: x, y or z.
-    turns_about: Option<String>,
+    symmetric_about: Option<String>,
     /// Find the mesh's symmetries and store those that are certain, by `shape` or by shape and `colors`. The job's result lists
     /// all.
     find_symmetries: Option<String>,
@@ -124,12 +125,12 @@ impl ObjectRequest {
         })?;
         let unit = mesh_unit(form)?;
         let axes = [("x", Axis::X), ("y", Axis::Y), ("z", Axis::Z)];
-        let turns_about = one_of(form, "turns_about", &axes, "x, y or z")?;
+        let symmetric_about = one_of(form, "symmetric_about", &axes, "x, y or z")?;
         let kinds = [("shape", Evidence::Shape), ("colors", Evidence::Colors)];
         let find_symmetries = one_of(form, "find_symmetries", &kinds, "shape or colors")?;
-        if find_symmetries.is_some() && turns_about.is_some() {
+        if find_symmetries.is_some() && symmetric_about.is_some() {
             let advice = "leave out one of the two";
-            return Err(ApiError::field("find_symmetries", "it and turns_about", "one of them", advice));
+            return Err(ApiError::field("find_symmetries", "it and symmetric_about", "one of them", advice));
         }
         let noise = form.number("noise", "millimetres, 0 to 100", |mm| (0.0..=100.0).contains(&mm))?;
         let resources = mesh_resources(form)?;
@@ -138,7 +139,7 @@ impl ObjectRequest {
             file_name: mesh.name.clone(),
             format: MeshFormat::of(&mesh.name)?,
             unit,
-            turns_about,
+            symmetric_about,
             find_symmetries,
             noise: noise.unwrap_or(0.0) / 1000.0,
             replace: form.parsed("replace", "true or false")?.unwrap_or(false),
@@ -163,7 +164,7 @@ impl ObjectRequest {
             let by_color = evidence == Evidence::Colors;
             (info.symmetries_discrete, info.symmetries_continuous) = sure_symmetries(&found, by_color);
         }
-        if let Some(axis) = self.turns_about {
+        if let Some(axis) = self.symmetric_about {
             let axis = match axis {
                 Axis::X => Vec3::x(),
                 Axis::Y => Vec3::y(),

@@ -183,7 +183,12 @@ fn of_other_paths() -> Vec<Case> {
             "metres",
             Form::default().text("name", "new").text("unit", "m").file("mesh", "m.ply", &mesh),
         ),
-        object(422, "turns_about", "w", named("new").text("turns_about", "w").file("mesh", "m.ply", &mesh)),
+        object(
+            422,
+            "symmetric_about",
+            "w",
+            named("new").text("symmetric_about", "w").file("mesh", "m.ply", &mesh),
+        ),
         object(409, "name", "exists already", named("duck").file("mesh", "m.ply", &mesh)),
     ]
 }

@@ -47,7 +47,7 @@ fn an_uploaded_mesh_is_stored_found_replaced_and_removed() {
     let form = Form::default()
         .text("name", "my-duck")
         .text("unit", "mm")
-        .text("turns_about", "z")
+        .text("symmetric_about", "z")
         .text("replace", "true")
         .file("mesh", "driller.ply", &other);
     let stored = server.result_of("/v1/objects", &form).expect(200).json();
@@ -81,7 +81,7 @@ fn sure_symmetries_of_an_uploaded_mesh_are_stored() {
         let problem = server.post("/v1/objects", &form("other").text(name, value)).expect(422).json();
         assert_eq!(problem["field"], name);
     }
-    let both = form("other").text("find_symmetries", "shape").text("turns_about", "z");
+    let both = form("other").text("find_symmetries", "shape").text("symmetric_about", "z");
     assert_eq!(server.post("/v1/objects", &both).expect(422).json()["field"], "find_symmetries");
 }
 

@@ -97,7 +97,7 @@ impl MethodArguments for ViewsArguments {
         estimator.options.seed = common.seed;
         estimator.options.outline = !self.no_refine;
         let proposals = match &self.proposals {
-            Some(file) => TrainedDetector::load(file).context("--proposals")?,
+            Some(file) => TrainedDetector::load(file).context("--proposals")?.for_proposals(),
             None => TrainedDetector::proposals().context("the detector within the program")?,
         };
         Ok(Box::new(estimator.with_proposals(Arc::new(proposals))))
@@ -129,7 +129,7 @@ impl MethodArguments for Pix2PoseArguments {
         let mut own = if self.preset.published() { OwnWeights::published() } else { OwnWeights::default() };
         own.options.estimate.seed = common.seed;
         if let Some(passes) = self.passes {
-            own.options.looks = passes.get();
+            own.options.passes = passes.get();
         }
         own.refine &= !self.no_refine;
         own.icp = self.icp;

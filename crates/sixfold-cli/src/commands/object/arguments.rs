@@ -26,7 +26,7 @@ pub(crate) struct ObjectArguments {
 pub(crate) enum ObjectCommand {
     /// Store a mesh under a name, or an object seen in depth images
     #[command(after_help = "Examples:\n  \
-        sixfold object add mug mug.ply --unit mm --turns-about z --templates\n  \
+        sixfold object add mug mug.ply --unit mm --symmetric-about z --templates\n  \
         sixfold object add mug --depth d.png --mask mask.png --camera camera.json")]
     Add(Box<AddArguments>),
     /// List the stored objects
@@ -90,12 +90,12 @@ pub(crate) struct AddArguments {
     #[arg(long, value_name = "ID")]
     pub model_id: Option<u32>,
     /// Axis of a continuous symmetry, in the object's frame: x, y or z
-    #[arg(long, value_name = "AXIS", conflicts_with = "models_info")]
-    pub turns_about: Option<Axis>,
+    #[arg(long, alias = "turns-about", value_name = "AXIS", conflicts_with = "models_info")]
+    pub symmetric_about: Option<Axis>,
     /// Find the mesh's symmetries (`sixfold object symmetries`) and store those that are certain, by shape and colours or by shape
     /// alone
     #[arg(long, value_enum, value_name = "BY", num_args = 0..=1, default_missing_value = "colors",
-        conflicts_with_all = ["turns_about", "depth"])]
+        conflicts_with_all = ["symmetric_about", "depth"])]
     pub find_symmetries: Option<Evidence>,
     /// Noise of the mesh's surface, standard deviation in millimetres, for --find-symmetries
     #[arg(long, value_name = "MM", default_value_t = 0.0, requires = "find_symmetries", conflicts_with = "depth", value_parser = ranges::surface_noise)]

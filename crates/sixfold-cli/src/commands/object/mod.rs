@@ -152,7 +152,7 @@ fn info(a: &AddArguments, mesh: &Mesh) -> Result<ModelInfo> {
         info.symmetries_discrete = found.symmetries_discrete.clone();
         info.symmetries_continuous = found.symmetries_continuous.clone();
     }
-    match a.turns_about {
+    match a.symmetric_about {
         Some(Axis::X) => info.rotates_freely_about(Vec3::x()),
         Some(Axis::Y) => info.rotates_freely_about(Vec3::y()),
         Some(Axis::Z) => info.rotates_freely_about(Vec3::z()),

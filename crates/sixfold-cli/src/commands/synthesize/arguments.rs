@@ -91,7 +91,7 @@ pub(crate) struct SynthesizeArguments {
     /// Name of the new dataset's split
     #[arg(long, value_name = "NAME", default_value = "train_nol", value_parser = ranges::folder_name)]
     pub new_split: String,
-    /// Make views as the dissertation describes it: --select pose, --refinement published, --turns 7 (docs/published.md)
+    /// Make views as the dissertation describes it: --select pose, --refinement published, --rotations 7 (docs/published.md)
     #[arg(long, value_name = "NAME", value_enum)]
     pub preset: Option<Preset>,
     /// How photographs are chosen (default: surface; with --preset published: pose)
@@ -138,8 +138,8 @@ pub(crate) struct SynthesizeArguments {
     pub elevation: Vec<f64>,
     /// Images of each view, each with another in-plane rotation (up to 45 degrees) (default: 1; with --preset
     /// published: 7, every 15 degrees)
-    #[arg(long, value_name = "N")]
-    pub turns: Option<usize>,
+    #[arg(long, alias = "turns", value_name = "N")]
+    pub rotations: Option<usize>,
     /// Side of the new images in pixels
     #[arg(long, value_name = "PIXELS", default_value = "192")]
     pub size: usize,
@@ -185,10 +185,14 @@ impl SynthesizeArguments {
                 "--elevation: found {low},{high}, expected two angles from -90 to 90 degrees, the lower one first"
             );
         }
-        if !(1..=72).contains(&self.turns()) {
-            bail!("--turns: found {}, expected 1 to 72", self.turns());
+        if !(1..=72).contains(&self.rotations()) {
+            bail!("--rotations: found {}, expected 1 to 72", self.rotations());
         }
-        in_range("views of an object by --step, --elevation and --turns", self.grid().count(), 1..=200_000)?;
+        in_range(
+            "views of an object by --step, --elevation and --rotations",
+            self.grid().count(),
+            1..=200_000,
+        )?;
         if !(32..=1024).contains(&self.size) {
             bail!("--size: found {}, expected 32 to 1024 pixels", self.size);
         }
@@ -218,8 +222,8 @@ impl SynthesizeArguments {
     }
 
     /// Images of each view.
-    fn turns(&self) -> usize {
-        self.turns.unwrap_or(if self.preset.is_some() { 7 } else { 1 })
+    fn rotations(&self) -> usize {
+        self.rotations.unwrap_or(if self.preset.is_some() { 7 } else { 1 })
     }
 
     /// The criterion by which photographs are chosen.
@@ -244,7 +248,7 @@ impl SynthesizeArguments {
     /// The viewpoints of the views.
     pub fn grid(&self) -> ViewGrid {
         let (step, elevation) = (self.step, [self.elevation[0], self.elevation[1]]);
-        ViewGrid { step, elevation, turns: self.turns(), size: self.size, seed: self.seed }
+        ViewGrid { step, elevation, rotations: self.rotations(), size: self.size, seed: self.seed }
     }
 
     /// How poses are refined.
@@ -275,7 +279,7 @@ impl SynthesizeArguments {
             "weighting": format!("{:?}", self.weighting), "weights": self.weights,
             "detector": self.detector, "no_refine": self.no_refine, "scene": format!("{:?}", self.scene),
             "rough": self.rough, "disturb": self.disturb, "step": self.step, "elevation": self.elevation,
-            "turns": self.turns(), "select": format!("{:?}", self.select()),
+            "rotations": self.rotations(), "select": format!("{:?}", self.select()),
             "refinement": format!("{:?}", self.refinement_kind()), "size": self.size, "backgrounds": self.backgrounds,
             "with_photographs": self.with_photographs, "seed": self.seed,
         })

@@ -234,8 +234,8 @@ fn settings(bench: &Bench) -> Vec<Setting> {
         },
         Setting {
             refine: true,
-            looks: 2,
-            ..plain("two-looks", "default, with a second pass into the box of the aligned pose")
+            passes: 2,
+            ..plain("two-passes", "default, with a second pass into the box of the aligned pose")
         },
         plain("no-refinement", "two stages, PnP"),
     ];

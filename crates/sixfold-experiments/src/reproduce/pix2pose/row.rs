@@ -27,7 +27,7 @@ pub(super) struct Setting {
     /// Whether the outline is aligned as the last step.
     pub refine: bool,
     /// With refinement: the number of passes.
-    pub looks: usize,
+    pub passes: usize,
     /// With refinement: whether the model's known systematic error is corrected.
     pub correct: bool,
     /// With refinement: whether the refiner refines the aligned pose.
@@ -107,7 +107,7 @@ impl Setting {
             title: title.to_string(),
             options: Pix2PoseOptions::default(),
             refine: false,
-            looks: AlignOptions::default().looks,
+            passes: AlignOptions::default().passes,
             correct: true,
             refiner: true,
             edges: true,
@@ -121,7 +121,7 @@ impl Setting {
     pub fn of(&self, pix2pose: &Pix2Pose, seed: u64) -> Pix2Pose {
         let mut options = AlignOptions {
             estimate: Pix2PoseOptions { seed, ..self.options.clone() },
-            looks: self.looks,
+            passes: self.passes,
             correct: self.correct,
             ..AlignOptions::default()
         };

@@ -1,4 +1,4 @@
-//! `made_up_mesh`, `drop_objects`: synthetic objects (`sixfold-synth`), and scenes of objects dropped on a table
+//! `synthetic_mesh`, `drop_objects`: synthetic objects (`sixfold-synth`), and scenes of objects dropped on a table
 //! (`sixfold-simulation`).
 
 use numpy::PyArray2;
@@ -18,11 +18,11 @@ use crate::trial::{PySolid, simulation_error};
 ///
 /// Raises ValueError for another kind.
 ///
-/// >>> 0.05 < made_up_mesh("mug", seed=3).diameter < 0.4
+/// >>> 0.05 < synthetic_mesh("mug", seed=3).diameter < 0.4
 /// True
 #[pyfunction]
 #[pyo3(signature = (kind="toy", *, seed=0))]
-pub(crate) fn made_up_mesh(py: Python<'_>, kind: &str, seed: i64) -> PyResult<PyMesh> {
+pub(crate) fn synthetic_mesh(py: Python<'_>, kind: &str, seed: i64) -> PyResult<PyMesh> {
     let mut random = ChaCha8Rng::seed_from_u64(arrays::seed(seed)?);
     let family = Family::ALL.into_iter().find(|family| family.name() == kind);
     if family.is_none() && kind != "toy" {
@@ -47,7 +47,7 @@ pub(crate) fn made_up_mesh(py: Python<'_>, kind: &str, seed: i64) -> PyResult<Py
 ///
 /// Raises ValueError for options out of range.
 ///
-/// >>> can = Solid(made_up_mesh("can"), convex=True)
+/// >>> can = Solid(synthetic_mesh("can"), convex=True)
 /// >>> [pose.shape for pose in drop_objects([can, can], stacked=0) if pose is not None]
 /// [(4, 4), (4, 4)]
 #[pyfunction]

@@ -12,12 +12,12 @@ from scenes import box_mesh, posed
 CAMERA = sixfold.Camera(525.0, 525.0, 319.5, 239.5, 640, 480)
 
 
-def test_made_up_objects():
+def test_synthetic_objects():
     for kind in ("can", "mug", "cup", "bottle", "bowl", "box", "clamp", "drill", "toy"):
-        mesh = sixfold.made_up_mesh(kind, seed=4)
+        mesh = sixfold.synthetic_mesh(kind, seed=4)
         assert 0.03 < mesh.diameter < 0.5 and len(mesh.faces) > 4
-        assert (mesh.vertices == sixfold.made_up_mesh(kind, seed=4).vertices).all()
-        assert not np.array_equal(mesh.vertices, sixfold.made_up_mesh(kind, seed=5).vertices)
+        assert (mesh.vertices == sixfold.synthetic_mesh(kind, seed=4).vertices).all()
+        assert not np.array_equal(mesh.vertices, sixfold.synthetic_mesh(kind, seed=5).vertices)
 
 
 def test_they_fall_and_rest():
@@ -38,7 +38,7 @@ def test_they_fall_and_rest():
 @pytest.fixture
 def scene():
     """Two objects before a camera: meshes, poses, drawn."""
-    meshes = {3: box_mesh((0.1, 0.06, 0.04)), 7: sixfold.made_up_mesh("mug", seed=1)}
+    meshes = {3: box_mesh((0.1, 0.06, 0.04)), 7: sixfold.synthetic_mesh("mug", seed=1)}
     poses = {3: posed((0.0, 0.0, 0.6), (0.4, 0.2, 0.1)), 7: posed((0.03, 0.01, 0.8), (0.1, 0.5, 0.0))}
     return meshes, poses, sixfold.render_scene([(meshes[i], poses[i]) for i in meshes], CAMERA)
 
@@ -109,8 +109,8 @@ def test_wrong_use(scene, tmp_path):
         (lambda: bop.write_targets(tmp_path / "t.json", [(1, 1, 1, 0)]), "targets"),
         (lambda: bop.write_camera(tmp_path, lens, 0.1), "camera"),
         (lambda: bop.write_camera(tmp_path, CAMERA, -1), "mm_per_unit"),
-        (lambda: sixfold.made_up_mesh("teapot"), "kind: .*mug.* or toy, found"),
-        (lambda: sixfold.made_up_mesh(seed=-1), "seed"),
+        (lambda: sixfold.synthetic_mesh("teapot"), "kind: .*mug.* or toy, found"),
+        (lambda: sixfold.synthetic_mesh(seed=-1), "seed"),
         (lambda: sixfold.drop_objects([solid], radius=-1), "radius"),
         (lambda: sixfold.drop_objects([solid], reach=0.1), "reach"),
         (lambda: sixfold.drop_objects([solid], upright=np.nan), "upright"),
