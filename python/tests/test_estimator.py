@@ -172,7 +172,7 @@ def test_options_of_other_methods_are_refused(tmp_path):
         with pytest.raises(FileNotFoundError, match="none.safetensors"):
             sixfold.Estimator(method, weights=tmp_path / "none.safetensors")
     with pytest.raises(TypeError):
-        sixfold.Estimator("ppf", passes=2)
+        sixfold.Estimator("ppf", looks=2)
 
 
 def test_wrong_searches(camera, weights):

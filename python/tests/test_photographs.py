@@ -79,7 +79,7 @@ def test_poses_get_better(taken, view_camera, untextured):
 
     assert refined.camera_from_object.shape == (8, 4, 4)
     assert errors(refined.camera_from_object) < 0.75 * errors(rough)
-    assert refined.moved.shape == refined.turned.shape == (8,) and refined.differences.shape == (8, 2)
+    assert refined.moved.shape == refined.rotated.shape == (8,) and refined.differences.shape == (8, 2)
     assert np.nanmean(refined.differences[:, 1]) < np.nanmean(refined.differences[:, 0])
     assert len(refined) == len(refined.dropped) == 8
     kept = refined.photographs
