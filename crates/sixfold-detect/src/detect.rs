@@ -24,7 +24,7 @@ pub struct DetectOptions {
     /// Maximum number of detections of an image, the best ones.
     pub max_detections: usize,
     /// Number of sizes at which the network processes the image, each smaller by the square root of two: a detector of any object
-    /// finds large ones better in a reduced image. The networks with anchors, which have levels for that, use one.
+    /// finds large ones better in a reduced image. Networks with anchors accept 1 only.
     pub scales: usize,
     /// Also compute masks.
     pub masks: bool,

@@ -54,7 +54,7 @@ impl TrainedDetector {
     pub fn for_proposals(self) -> TrainedDetector {
         let options = DetectOptions {
             masks: false,
-            scales: PROPOSAL_SCALES,
+            scales: if self.model.has_scales() { PROPOSAL_SCALES } else { 1 },
             overlap: PROPOSAL_OVERLAP,
             per_class: MAX_PROPOSALS,
             max_detections: MAX_PROPOSALS,

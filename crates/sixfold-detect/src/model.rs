@@ -336,6 +336,11 @@ impl DetectorModel {
         DetectOptions { threshold: self.usage.threshold, ..DetectOptions::default() }
     }
 
+    /// Whether it processes images at several sizes ([`DetectOptions::scales`]).
+    pub(crate) fn has_scales(&self) -> bool {
+        matches!(self.network, Network::Anchorless(_))
+    }
+
     /// Detects the model's objects in an image of any size, best first.
     ///
     /// # Errors
@@ -358,6 +363,10 @@ impl DetectorModel {
             Network::Anchored(..) if image.size().0 == 0 || image.size().1 == 0 => {
                 Err(ModelError::EmptyImage)
             }
+            Network::Anchored(..) if options.scales != 1 => Err(ModelError::Option(format!(
+                "detection option scales: found {}, expected 1: the network has anchors of all sizes",
+                options.scales
+            ))),
             Network::Anchored(network, labels) => Ok(anchored(network, labels, image, options)),
         }
     }

@@ -274,6 +274,9 @@ fn a_detector_gives_the_objects_of_its_labels() {
         let mask = e.mask.as_ref().unwrap().pasted(&e.corners, image.size()).mask(image.size());
         assert_eq!(f.mask.as_ref(), Some(&mask));
     }
+    let several = DetectOptions { scales: 2, ..options };
+    let message = model.detect(&image, &several).unwrap_err().to_string();
+    assert!(message.contains("scales") && message.contains("expected 1"), "{message}");
     let none = DetectOptions { masks: false, ..options };
     assert!(model.detect(&image, &none).unwrap().iter().all(|d| d.mask.is_none()));
 

@@ -50,7 +50,8 @@ pub(crate) struct DetectArguments {
     /// Maximum number of detections in an image (default: 100; 300 without --weights)
     #[arg(long, value_name = "N")]
     pub max_detections: Option<usize>,
-    /// Number of sizes at which an image is processed, each smaller by the square root of two (default: 1; 3 without --weights)
+    /// Number of sizes at which an image is processed, each smaller by the square root of two (default: 1; 3 without --weights;
+    /// networks with anchors: 1 only)
     #[arg(long, value_name = "N")]
     pub scales: Option<usize>,
     /// Boxes only
