@@ -28,7 +28,8 @@ pub struct AlignOptions {
     pub passes: usize,
     /// Weight of the refiner's pose, 0 to 1, in the final one; the rest is that of the aligned outline. Their errors are different,
     /// so that a mean is nearer than either. 0: the refiner is not used. Chosen by ADD(-S)
-    /// recall on 602 targets of 84 LM-O development frames, ground-truth boxes: with 0, 0.3, 0.4, 0.5 .518, .548, .548, .565.
+    /// recall on 602 targets of 84 LM-O development frames, ground-truth boxes: with 0, 0.3, 0.4, 0.5 .518, .548, .548, .565;
+    /// larger ones were not measured since the refiner's distances are corrected.
     pub refiner_weight: f64,
     /// Correct the model's systematic error for the object.
     pub correct: bool,

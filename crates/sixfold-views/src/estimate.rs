@@ -15,7 +15,7 @@ use crate::colour::{Chroma, chromas, grey};
 use crate::crop::Crop;
 use crate::error::ViewsError;
 use crate::features::{Extractor, FeatureMap};
-use crate::matching::{Match, best_near, colour_similarity, dot, mutual_matches, similarity};
+use crate::matching::{Match, best_near, dot, mutual_matches, similarity};
 use crate::network::input;
 use crate::refiner::{Refiner, Target};
 use crate::templates::{CROP_FACTOR, Template, cells_on_object, gathered, input_over_grey, render};
@@ -63,8 +63,8 @@ pub struct ViewsOptions {
 /// Chosen by AR_MSSD on 86 targets of every ninth LM-O development frame: `reprojection` from 3, 4, 6, 9 pixels, `refine_reach`
 /// from 2, 3 cells; with the refiner AR_MSSD / AR_MSPD / ADD(-S) recall with 8 hypotheses were .436 / .650 / .326, with 12 .462 /
 /// .659 / .326, with 12 and `close` 4 instead of 2 .470 / .669 / .349 (without the refiner .431 / .643 / .302), with `close_side`
-/// 192 and `close` 2 .444 / .636 / .279. Without a region, on 85 targets: 100 proposals of one scale, 4 places and features alone .228 / .316 / .200; colours with
-/// `place_colour` 0.5 .236 / .359 / .200 (the right one is among the first 4 places 42 times instead of 32; with 0.2 and 1.2 38 and
+/// 192 and `close` 2 .444 / .636 / .279. Without a region, on 85 targets: 100 proposals of one scale, 4 places and features
+/// alone .228 / .316 / .200; colours with `place_colour` 0.5 .236 / .359 / .200 (the right one is among the first 4 places 42 times instead of 32; with 0.2 and 1.2 38 and
 /// 40 times); 8 places .253 / .369 / .200; 200 proposals of three scales .260 / .380 / .188, with 6 hypotheses instead of 12
 /// .256 / .378 / .188 in 0.6 of the time. Colours do not help to choose templates in a given region (.452 / .652 / .388 with a
 /// weight of 0.2 instead of .481 / .673 / .424). The others were chosen by hand.
@@ -466,8 +466,6 @@ pub(crate) struct Part {
     patch: Patch,
     input: Vec<f32>,
     pub(crate) map: FeatureMap,
-    /// Colours of the cells; `None` if the image is grey.
-    pub(crate) chromas: Option<Vec<Chroma>>,
 }
 
 impl Part {
@@ -483,13 +481,12 @@ impl Part {
         let patch = crop.cut(image, camera, [0.5; 3]);
         let input = input(&patch.data);
         let maps = extractor.features(std::slice::from_ref(&input), side)?;
-        let chromas = Some(chromas(&patch.data, side, |_| true)).filter(|chromas| !grey(chromas));
-        Ok(maps.into_iter().next().map(|map| Part { crop, patch, input, map, chromas }))
+        Ok(maps.into_iter().next().map(|map| Part { crop, patch, input, map }))
     }
 
-    /// Similarity of its colours to a template's, 0 to 1; 0 if either has none.
-    pub(crate) fn colour_of(&self, template: &Template) -> f32 {
-        self.chromas.as_ref().map_or(0.0, |chromas| colour_similarity(template, chromas))
+    /// The colours of its cells; `None` if they are all grey.
+    pub(crate) fn chromas(&self) -> Option<Vec<Chroma>> {
+        Some(chromas(&self.patch.data, self.patch.width, |_| true)).filter(|chromas| !grey(chromas))
     }
 
     fn target(&self) -> Target<'_> {

@@ -10,10 +10,12 @@ use sixfold_align::outline::projected_box;
 use sixfold_estimator::{EstimatorError, ObjectDetector};
 use sixfold_geometry::{Camera, Rect, RgbImage};
 
+use crate::colour::Chroma;
 use crate::error::ViewsError;
 use crate::estimate::{Hypothesis, Part, Views};
 use crate::features::Extractor;
-use crate::matching::quick_similarity;
+use crate::matching::{colour_similarity, quick_similarity};
+use crate::templates::Template;
 
 /// Boxes of two poses that overlap more than this (intersection over union) belong to one instance.
 const ONE_INSTANCE: f64 = 0.5;
@@ -22,6 +24,18 @@ const ONE_INSTANCE: f64 = 0.5;
 pub(crate) struct Place {
     bbox: Rect,
     part: Part,
+    chromas: Option<Vec<Chroma>>,
+}
+
+impl Place {
+    fn new(bbox: Rect, part: Part) -> Place {
+        Place { bbox, chromas: part.chromas(), part }
+    }
+
+    /// Similarity of its colours to a template's, 0 to 1; 0 if either has none.
+    fn colour_of(&self, template: &Template) -> f32 {
+        self.chromas.as_ref().map_or(0.0, |chromas| colour_similarity(template, chromas))
+    }
 }
 
 /// The places of an image, computed once.
@@ -47,7 +61,7 @@ impl Places {
         detected.truncate(most);
         let place = |bbox: Rect| -> Result<Option<Place>, ViewsError> {
             let part = Part::new(extractor, image, camera, &bbox, side)?;
-            Ok(part.map(|part| Place { bbox, part }))
+            Ok(part.map(|part| Place::new(bbox, part)))
         };
         let places: Result<Vec<Option<Place>>, ViewsError> =
             detected.par_iter().map(|d| place(d.region.bbox)).collect();
@@ -67,7 +81,7 @@ impl Views<'_> {
         instances: usize,
     ) -> Result<Vec<Hypothesis>, ViewsError> {
         let mut alike: Vec<(&Place, f32)> =
-            places.par_iter().map(|place| (place, self.max_similarity(&place.part))).collect();
+            places.par_iter().map(|place| (place, self.max_similarity(place))).collect();
         alike.sort_by(|a, b| b.1.total_cmp(&a.1));
         alike.truncate(self.options.places.saturating_add(instances - 1));
         let mut pool: Vec<(usize, Hypothesis)> = Vec::new();
@@ -96,9 +110,9 @@ impl Views<'_> {
     }
 
     /// Similarity of a crop to its most similar template, on a subset of features: selects the places to examine further.
-    fn max_similarity(&self, part: &Part) -> f32 {
+    fn max_similarity(&self, place: &Place) -> f32 {
         let weight = self.options.place_colour;
-        let of = |template| quick_similarity(template, &part.map) + weight * part.colour_of(template);
+        let of = |template| quick_similarity(template, &place.part.map) + weight * place.colour_of(template);
         self.templates.par_iter().map(of).reduce(|| f32::NEG_INFINITY, f32::max)
     }
 
@@ -109,5 +123,45 @@ impl Views<'_> {
             (Some(a), Some(b)) => a.iou(&b) > ONE_INSTANCE,
             _ => self.same(a, b),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::estimate::ViewsOptions;
+    use crate::estimate::tests::{part, photographed};
+    use crate::templates::{TemplateOptions, make_templates};
+
+    #[test]
+    fn a_place_in_other_colours_is_less_similar() {
+        let camera = Camera::new(570.0, 570.0, 319.5, 239.5, 640, 480).unwrap();
+        let (image, _, bbox) = photographed(&camera);
+        let swapped = image.map(|[red, green, blue]| [*blue, *green, *red]);
+        let grey = image.map(|rgb| [rgb[1]; 3]);
+        let extractor = Extractor::shipped().unwrap();
+        let mesh = part();
+        let few = TemplateOptions { directions: 20, rotations: 4, ..TemplateOptions::default() };
+        let templates = make_templates(&mesh, "part", mesh.diameter(), &extractor, &few).unwrap();
+        let options = ViewsOptions::default();
+        let place = |image: &RgbImage| {
+            Place::new(bbox, Part::new(&extractor, image, &camera, &bbox, options.side).unwrap().unwrap())
+        };
+        let best = |place: &Place| templates.iter().map(|t| place.colour_of(t)).fold(0.0, f32::max);
+        let [own, other, none] = [&image, &swapped, &grey].map(|image| best(&place(image)));
+        assert!(own > other + 0.1 && none == 0.0, "{own} {other} {none}");
+        let similarity = |place_colour: f32| {
+            let options = ViewsOptions { place_colour, ..options.clone() };
+            let views = Views {
+                extractor: &extractor,
+                mesh: &mesh,
+                outline: &mesh,
+                templates: &templates,
+                refiner: None,
+                options: &options,
+            };
+            views.max_similarity(&place(&image))
+        };
+        assert!(similarity(0.5) > similarity(0.0) + 0.1);
     }
 }
