@@ -42,4 +42,4 @@ pub use grasp::{AntipodalQuality, Grasp, centre_between_pads, gripper_pose};
 pub use grasp_file::{GraspFileError, TriedGrasp, read_grasp, read_tried_grasp};
 pub use gripper::{Gripper, GripperBox};
 pub use gripper_file::{GripperError, parse_gripper, read_gripper};
-pub use view::{GraspView, ViewError, ViewOptions, find_objects};
+pub use view::{GraspView, ViewError, ViewOptions, find_objects, find_table};

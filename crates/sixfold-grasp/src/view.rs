@@ -198,7 +198,7 @@ impl GraspView {
         if pixels == 0 {
             return Err(ViewError::EmptyMask);
         }
-        let table = table(&depth, camera, options);
+        let table = find_table(&depth, camera, options);
         let above = above_table(&depth, camera, table.as_ref(), 0.5 * options.table_margin);
         let mut object = Mask::from_fn(depth.width(), depth.height(), |x, y| mask[(x, y)] && above[(x, y)]);
         let parts = components(&object, &depth, camera, options.gap);
@@ -287,7 +287,7 @@ pub fn find_objects(
     options: &ViewOptions,
 ) -> Result<Vec<Mask>, ViewError> {
     let depth = checked(depth, camera, options)?;
-    let table = table(&depth, camera, options)
+    let table = find_table(&depth, camera, options)
         .ok_or(ViewError::NoTable { percent: 100.0 * options.plane.min_fraction })?;
     // Objects on the table are above a measured part of it; the background behind the table's edge is not.
     let above = above_table(&depth, camera, Some(&table), options.table_margin);
@@ -358,8 +358,9 @@ fn point_at(depth: &DepthImage, camera: &Camera, x: usize, y: usize) -> Vec3 {
     camera.unproject(&Vec2::new(x as f64, y as f64), f64::from(depth[(x, y)]))
 }
 
-/// The table, from every third pixel in both directions.
-fn table(depth: &DepthImage, camera: &Camera, options: &ViewOptions) -> Option<Plane> {
+/// The plane that most of a depth image shows, taken as the table, its normal towards the camera; from every third pixel in both
+/// directions. The depth (metres) is of a camera without distortion. `None` if no plane has enough points.
+pub fn find_table(depth: &DepthImage, camera: &Camera, options: &ViewOptions) -> Option<Plane> {
     let thinned = Image::from_fn(depth.width(), depth.height(), |x, y| {
         if x % 3 == 0 && y % 3 == 0 { depth[(x, y)] } else { 0.0 }
     });

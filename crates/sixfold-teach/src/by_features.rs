@@ -1,11 +1,12 @@
 //! The first step of a teaching without a board: features of all photographs, then their poses; and the known length that gives the
 //! scale.
 
-use sixfold_geometry::Progress;
+use sixfold_geometry::{Camera, DepthImage, Progress};
 use sixfold_io::{ImageFile, read_depth, read_rgb};
 use sixfold_nn::keypoints::KeypointFinder;
 
 use crate::error::TeachError;
+use crate::one_side::camera_above_table;
 use crate::shape::step;
 use crate::teaching::{By, Step, Teaching, World, is_same, rows};
 use crate::unboarded::{KnownLength, PutTogether, SeenFeatures, features_of, put_together};
@@ -53,6 +54,11 @@ impl Teaching {
         if length.is_none() && used.iter().all(|i| self.photographs()[*i].depth.is_none()) {
             return Err(TeachError::NoScale);
         }
+        if let ([number], Some(camera)) = (&used[..], self.known.state.given_camera)
+            && let Some(depth) = depth_of(0)?
+        {
+            return self.locate_above_table(*number, &depth, &camera);
+        }
         let finder = KeypointFinder::shipped().map_err(|e| TeachError::Masks(e.into()))?;
         let mut seen = vec![];
         for (done, number) in used.iter().enumerate() {
@@ -70,6 +76,25 @@ impl Teaching {
         let camera = self.known.state.given_camera;
         let found = put_together(&seen, camera.as_ref(), length.as_ref(), &depth_of, &rest)?;
         self.keep_poses(&used, found)
+    }
+
+    /// The pose of a single photograph above the table that its depth shows.
+    fn locate_above_table(
+        &mut self,
+        number: usize,
+        depth: &DepthImage,
+        camera: &Camera,
+    ) -> Result<(), TeachError> {
+        let (width, height) = depth.size();
+        if (camera.width, camera.height) != (width, height) {
+            let (camera_width, camera_height) = (camera.width, camera.height);
+            return Err(TeachError::CameraSize { width, height, camera_width, camera_height });
+        }
+        let file = self.photographs()[number].name.clone();
+        let pose = camera_above_table(depth, camera).ok_or(TeachError::NoTable { file })?;
+        let found =
+            PutTogether { camera: *camera, camera_from_world: vec![Ok(pose)], floor: Some(0.0), rms: 0.0 };
+        self.keep_poses(&[number], found)
     }
 
     /// The length with the numbers of the photographs that are used.

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use sixfold_board::BoardError;
 use sixfold_estimator::StoreError;
+use sixfold_grasp::ViewError;
 use sixfold_io::ImageFileError;
 use sixfold_nn::keypoints::KeypointError;
 use sixfold_sfm::SfmError;
@@ -130,13 +131,24 @@ pub enum TeachError {
     },
     /// Several objects.
     #[error(
-        "found {found} objects on the board, the second {percent:.0} % as large as the first: leave one, or give masks"
+        "found {found} objects, the second {percent:.0} % as large as the first: leave one, or give masks"
     )]
     SeveralObjects {
         /// Number of objects.
         found: usize,
         /// Size of the second against the first, percent.
         percent: f64,
+    },
+    /// A depth image from one side that does not show the object.
+    #[error("depth from one side: {0}")]
+    OneDepth(#[from] ViewError),
+    /// One photograph without a board whose depth image shows no table.
+    #[error(
+        "{file}: its depth image shows no table: expected an object that stands on a plane, or give poses and masks (docs/teach.md)"
+    )]
+    NoTable {
+        /// The photograph.
+        file: String,
     },
     /// Masks of photographs contradict each other.
     #[error(

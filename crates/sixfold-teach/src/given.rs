@@ -62,6 +62,30 @@ impl Masked {
     }
 }
 
+/// The mean of the salient region's probability over each of some masks, which have no lens distortion.
+pub(crate) fn salient_fraction(
+    p: &PosedPhotograph,
+    segmenter: &dyn Segmenter,
+    options: &ShapeOptions,
+    masks: &[Mask],
+) -> Result<Vec<f64>, Box<dyn std::error::Error + Send + Sync>> {
+    let (image, camera) = undistorted(&p.image, Some(&p.camera), options.coarse_side);
+    let (foreground, camera) = (segmenter.foreground(&image)?, camera.unwrap_or(p.camera));
+    let of = |mask: &Mask| {
+        let reduced = |x: usize, y: usize| {
+            let scale = p.camera.width as f64 / camera.width as f64;
+            let at = |k: usize| ((k as f64 + 0.5) * scale) as usize;
+            mask.get(at(x), at(y)).copied().unwrap_or(false)
+        };
+        let (w, h) = foreground.size();
+        let pixels =
+            (0..w * h).filter(|i| reduced(i % w, i / w)).map(|i| f64::from(foreground.as_slice()[i]));
+        let (sum, count) = pixels.fold((0.0, 0.0), |(sum, count), value| (sum + value, count + 1.0));
+        sum / f64::max(count, 1.0)
+    };
+    Ok(masks.iter().map(of).collect())
+}
+
 /// The pixels that certainly show the object, in a photograph whose mask was given.
 pub(crate) fn certain(p: &PosedPhotograph) -> Option<Mask> {
     let mask = p.mask.as_ref()?;

@@ -38,6 +38,31 @@ impl Grid {
         self.low + Vec3::new(x as f64, y as f64, z as f64) * self.step
     }
 
+    /// The value at a point between voxels; `None` outside the grid.
+    pub fn at(&self, point: &Vec3) -> Option<f32> {
+        let place = (point - self.low) / self.step;
+        let mut corner = [0; 3];
+        for k in 0..3 {
+            if !(place[k] >= 0.0 && place[k] <= (self.size[k] - 1) as f64) {
+                return None;
+            }
+            corner[k] = (place[k] as usize).min(self.size[k].saturating_sub(2));
+        }
+        let mut sum = 0.0;
+        for i in 0..8 {
+            let side = |k: usize| (i >> k) & 1;
+            let weight = |k: usize| {
+                let fraction = (place[k] - corner[k] as f64) as f32;
+                if side(k) == 1 { fraction } else { 1.0 - fraction }
+            };
+            let weight = weight(0) * weight(1) * weight(2);
+            if weight > 0.0 {
+                sum += weight * self.values[self.index(std::array::from_fn(|k| corner[k] + side(k)))];
+            }
+        }
+        Some(sum)
+    }
+
     pub fn index(&self, [x, y, z]: [usize; 3]) -> usize {
         x + self.size[0] * (y + self.size[1] * z)
     }

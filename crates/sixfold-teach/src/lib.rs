@@ -21,6 +21,7 @@ mod grid;
 mod ground;
 mod hull;
 mod located;
+mod one_side;
 mod paint;
 mod pairs;
 mod pictures;

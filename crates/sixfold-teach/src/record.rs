@@ -12,8 +12,8 @@ use sixfold_estimator::{NewObject, Object, ObjectRecord, ObjectStore};
 use sixfold_geometry::{Camera, Pose, RgbImage, undistort_rgb};
 use sixfold_io::{limits, read_mask, read_regular_text, read_rgb, write_atomically, write_mask, write_rgb};
 use sixfold_mesh::{
-    FoundSymmetry, Mesh, ModelInfo, ModelsInfo, PlyFormat, SymmetryOptions, Unit, find_symmetries, ply_files,
-    sure_symmetries,
+    FoundSymmetry, Mesh, ModelInfo, ModelsInfo, PlyFormat, SymmetryOptions, Unit, Verdict, find_symmetries,
+    ply_files, sure_symmetries,
 };
 
 use crate::error::TeachError;
@@ -46,7 +46,7 @@ impl Snapshot {
     /// [`TeachError::Order`] before the mesh is made.
     pub fn symmetries(&self) -> Result<Vec<FoundSymmetry>, TeachError> {
         let mesh = self.mesh()?;
-        Ok(symmetries_of(&mesh, ModelInfo::of_mesh(&mesh).diameter))
+        Ok(self.symmetries_of(&mesh, ModelInfo::of_mesh(&mesh).diameter))
     }
 
     /// The object of this name, if it was stored from this folder as it is now, by [`Snapshot::store`].
@@ -75,7 +75,7 @@ impl Snapshot {
     ) -> Result<Stored, TeachError> {
         let mesh = self.mesh()?;
         let mut info = ModelInfo::of_mesh(&mesh);
-        let symmetries = symmetries_of(&mesh, info.diameter);
+        let symmetries = self.symmetries_of(&mesh, info.diameter);
         (info.symmetries_discrete, info.symmetries_continuous) = sure_symmetries(&symmetries, true);
         let source = self.folder().join(MESH);
         let record = ObjectRecord::of_mesh(&source, Unit::Metre, &mesh, &info);
@@ -89,11 +89,21 @@ impl Snapshot {
         })?;
         Ok(Stored { record, symmetries, photographs: posed.len() })
     }
+
+    /// No symmetry of an object seen from one side is sure: its other side was made from the seen one.
+    fn symmetries_of(&self, mesh: &Mesh, diameter: f64) -> Vec<FoundSymmetry> {
+        let options = SymmetryOptions { noise: NOISE * diameter, ..SymmetryOptions::default() };
+        let found = find_symmetries(mesh, &options).unwrap_or_default();
+        if self.shape().is_some_and(|shape| shape.one_side) { at_most_likely(found) } else { found }
+    }
 }
 
-fn symmetries_of(mesh: &Mesh, diameter: f64) -> Vec<FoundSymmetry> {
-    let options = SymmetryOptions { noise: NOISE * diameter, ..SymmetryOptions::default() };
-    find_symmetries(mesh, &options).unwrap_or_default()
+fn at_most_likely(mut found: Vec<FoundSymmetry>) -> Vec<FoundSymmetry> {
+    for symmetry in &mut found {
+        symmetry.by_shape = symmetry.by_shape.min(Verdict::Likely);
+        symmetry.by_shape_and_color = symmetry.by_shape_and_color.min(Verdict::Likely);
+    }
+    found
 }
 
 pub(crate) type Posed = (String, RgbImage, Camera, Pose, sixfold_geometry::Mask);
@@ -196,4 +206,27 @@ fn write_model(mesh: &Mesh, info: ModelInfo, id: u32, dataset: &Path) -> Result<
     let targets = json!([]);
     write_atomically(&dataset.join("test_targets_bop19.json"), targets.to_string().as_bytes())?;
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use sixfold_geometry::Vec3;
+
+    use super::*;
+
+    #[test]
+    fn symmetries_of_an_assumed_side_are_never_sure() {
+        let corner = |i: u32| Vec3::from([0, 1, 2].map(|k| if (i >> k) & 1 == 0 { -0.03 } else { 0.03 }));
+        let quads = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]];
+        let faces = quads.iter().flat_map(|[a, b, c, d]| [[*a, *b, *c], [*a, *c, *d]]).collect();
+        let cube = Mesh::new((0..8).map(corner).collect(), faces).unwrap();
+        let found = find_symmetries(&cube, &SymmetryOptions::default()).unwrap();
+        assert!(!sure_symmetries(&found, true).0.is_empty() && !sure_symmetries(&found, false).0.is_empty());
+        let unsure = at_most_likely(found.clone());
+        assert_eq!(unsure.len(), found.len());
+        for with_color in [false, true] {
+            assert!(sure_symmetries(&unsure, with_color).0.is_empty());
+            assert!(unsure.iter().any(|s| s.verdict(with_color) == Verdict::Likely));
+        }
+    }
 }

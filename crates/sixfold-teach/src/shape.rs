@@ -11,6 +11,7 @@ use crate::fusion::carved;
 use crate::given::{given_masks, searched_volume};
 use crate::grid::Grid;
 use crate::hull::{Outlined, hull};
+use crate::one_side::{self, OneSide};
 use crate::paint::{centre, finer, painted};
 use crate::placed::{PLACING_STEPS, placed};
 use crate::silhouette::{Cues, Segmenter, consensus, masks};
@@ -24,7 +25,7 @@ pub const FEWEST_PHOTOGRAPHS: usize = 4;
 /// The same with measured depth.
 pub const FEWEST_WITH_DEPTH: usize = 1;
 /// Minimum angle between the directions from the object to two of the photographs, degrees.
-const APART: f64 = 50.0;
+pub(crate) const APART: f64 = 50.0;
 /// A second part this large (fraction of the first) is a second object.
 const SECOND: f64 = 0.2;
 /// Parts whose boxes are this close belong to the same object, metres.
@@ -116,8 +117,13 @@ impl Capture {
 
     /// The plane below which there is no object.
     fn floor(&self) -> Option<Plane> {
-        self.floor.map(|floor| Plane { offset: floor.offset + TABLE, ..floor })
+        self.floor.map(above_table)
     }
+}
+
+/// The plane below which there is no object that stands on a plane.
+fn above_table(floor: Plane) -> Plane {
+    Plane { offset: floor.offset + TABLE, ..floor }
 }
 
 pub(crate) fn step(progress: &dyn Progress, done: usize, total: usize) -> Result<(), TeachError> {
@@ -147,6 +153,8 @@ pub struct Shape {
     pub unseen: f64,
     /// Fraction of the object's pixels in all photographs whose depth was measured or found by stereo comparison.
     pub with_depth: f64,
+    /// Whether depth showed one side only: the other side is then assumed from symmetry.
+    pub one_side: bool,
 }
 
 /// The views of the photographs that show a volume, with their numbers.
@@ -169,6 +177,9 @@ pub fn segment(
         Some(volume) => volume,
         None => {
             check_count(capture)?;
+            if let Some(found) = one_side::segmented(capture, segmenter, options)? {
+                return Ok(found);
+            }
             searched_volume(capture, segmenter, options)?
         }
     };
@@ -417,6 +428,9 @@ pub fn reconstruct(
 ) -> Result<Shape, TeachError> {
     let used: Vec<usize> = (0..found.masks.len()).filter(|i| found.masks[*i].is_some()).collect();
     step(progress, 0, SHAPE_STEPS)?;
+    let one_side = OneSide::of(capture, &found.masks)?;
+    let table = one_side.as_ref().and_then(|side| side.floor);
+    let floor = capture.floor.or(table).map(above_table);
     let numbered = views_of(capture, &found.volume, options.fine_side, &used);
     let masks: Vec<Mask> = numbered
         .iter()
@@ -424,22 +438,38 @@ pub fn reconstruct(
         .collect();
     let views: Vec<View> = numbered.into_iter().map(|(_, view)| view).collect();
     let outlined: Vec<Outlined<'_>> = views.iter().zip(&masks).map(|(v, m)| Outlined::new(v, m)).collect();
-    let rough = hull(&outlined, &found.volume, options.coarse_cells, capture.floor());
-    let parts = rough.components();
-    let first = parts.first().ok_or_else(no_object)?;
-    let volume = rough.volume_of(first).grown(2.0 * rough.step);
+    let volume = match &one_side {
+        Some(side) => side.volume,
+        None => {
+            let rough = hull(&outlined, &found.volume, options.coarse_cells, floor);
+            let parts = rough.components();
+            let first = parts.first().ok_or_else(no_object)?;
+            rough.volume_of(first).grown(2.0 * rough.step)
+        }
+    };
     step(progress, 1, SHAPE_STEPS)?;
-    let fine = hull(&outlined, &volume, options.fine_cells, capture.floor());
-    let fine = match capture.up.filter(|_| capture.floor.is_none()) {
+    let fine = hull(&outlined, &volume, options.fine_cells, floor);
+    let fine = match capture.up.filter(|_| floor.is_none()) {
         Some(up) => standing(fine, &views, &masks, &up),
         None => fine,
     };
     let (fine, with_depth) = match depth_of(capture, &used, &found.volume, &fine, found, options) {
-        Some(known) => {
+        Some(mut known) => {
             step(progress, 2, SHAPE_STEPS)?;
+            if let Some(side) = &one_side {
+                for (depth, view) in known.depths.iter_mut().zip(&known.views) {
+                    if side.is_of(view) {
+                        *depth = side.depth_in(view);
+                    }
+                }
+            }
             (carved(&fine, &known.views, &known.depths, 3.0 * fine.step, known.minimum), known.fraction)
         }
         None => (fine, 0.0),
+    };
+    let fine = match &one_side {
+        Some(side) => side.completed(&fine),
+        None => fine,
     };
     let mesh = surface(&fine.smoothed(0.8)).ok_or_else(no_object)?;
     step(progress, 3, SHAPE_STEPS)?;
@@ -450,7 +480,7 @@ pub fn reconstruct(
     let mesh = mesh.transformed(&world_from_object.inverse());
     let mesh = mesh.clone().with_colors(paint.colors).unwrap_or(mesh);
     step(progress, 4, SHAPE_STEPS)?;
-    Ok(Shape { mesh, world_from_object, unseen: paint.unseen, with_depth })
+    Ok(Shape { mesh, world_from_object, unseen: paint.unseen, with_depth, one_side: one_side.is_some() })
 }
 
 /// Progress of one part of several: it continues the count of the previous part.
@@ -498,7 +528,7 @@ pub(crate) fn lay(
         views_of(capture, &volume, options.fine_side, &used).into_iter().map(|(_, view)| view).collect();
     let paint = painted(&mesh.transformed(&world_from_object), &views);
     let mesh = if has_colors { mesh } else { mesh.clone().with_colors(paint.colors).unwrap_or(mesh) };
-    Ok(Shape { mesh, world_from_object, unseen: paint.unseen, with_depth: hull.with_depth })
+    Ok(Shape { mesh, world_from_object, unseen: paint.unseen, with_depth: hull.with_depth, one_side: false })
 }
 
 /// Depth of views, measured or found by stereo comparison.

@@ -9,7 +9,7 @@ use sixfold_geometry::nalgebra::{Rotation3, UnitQuaternion};
 use sixfold_geometry::random::{normal, stream, uniform};
 use sixfold_geometry::{BrownConrady, Camera, DepthImage, Image, Mask, Mat3, Pose, RgbImage, Vec2, Vec3};
 use sixfold_mesh::Mesh;
-use sixfold_render::{Light, Material, SceneObject, VisibilityBuffer, shade};
+use sixfold_render::{DepthSensor, Light, Material, SceneObject, VisibilityBuffer, shade, simulate_depth};
 
 pub use crate::ground::patterned;
 use crate::view::bilinear_rgb;
@@ -134,6 +134,24 @@ impl<'a> SimulatedCapture<'a> {
         let mut buffer = VisibilityBuffer::new(&self.options.camera.without_distortion());
         buffer.render(&self.scene.objects(pose), &Default::default());
         Some(buffer.depth())
+    }
+
+    /// Depth as a sensor measures it from the same camera pose, metres, for the pixels of the photograph with its lens distortion; 0
+    /// where nothing was measured. `None` beyond the last.
+    pub fn measured_depth(&self, number: usize, sensor: &DepthSensor) -> Option<DepthImage> {
+        let pose = self.camera_from_board.get(number)?;
+        let (lens, objects) = (&self.options.camera, self.scene.objects(pose));
+        let mut buffer = VisibilityBuffer::new(&lens.without_distortion());
+        buffer.render(&objects, &Default::default());
+        let seed = self.seed.wrapping_add(2000 + number as u64);
+        let noisy = simulate_depth(&buffer.depth(), &buffer.normals(&objects), sensor, seed);
+        let inside = |p: f64, size: usize| (p > -0.5 && p < size as f64 - 0.5).then(|| p.round() as usize);
+        Some(Image::from_fn(lens.width, lens.height, |x, y| {
+            let source = lens.undistort_point(&Vec2::new(x as f64, y as f64));
+            source
+                .and_then(|p| Some(noisy[(inside(p.x, lens.width)?, inside(p.y, lens.height)?)]))
+                .unwrap_or(0.0)
+        }))
     }
 
     /// The object's mask in a photograph, without lens distortion; `None` beyond the last.

@@ -101,6 +101,9 @@ pub struct ShapeFacts {
     pub unseen: f64,
     /// Fraction of the object's pixels with depth, measured or by stereo comparison of photographs.
     pub with_depth: f64,
+    /// Whether depth showed one side only: the other side is then assumed from symmetry.
+    #[serde(default)]
+    pub one_side: bool,
 }
 
 /// What the poses of the photographs are relative to.
@@ -499,6 +502,7 @@ impl Teaching {
             board_from_object: rows(&shape.world_from_object),
             unseen: shape.unseen,
             with_depth: shape.with_depth,
+            one_side: shape.one_side,
         });
         self.known.state.outdated = None;
         self.save()

@@ -175,7 +175,8 @@ impl View {
     }
 }
 
-fn nearest_pixel(p: &Vec2, width: usize, height: usize) -> Option<(usize, usize)> {
+/// The pixel of an image nearest to a point; `None` outside.
+pub(crate) fn nearest_pixel(p: &Vec2, width: usize, height: usize) -> Option<(usize, usize)> {
     let (x, y) = (p.x.round(), p.y.round());
     (x >= 0.0 && y >= 0.0 && x < width as f64 && y < height as f64).then_some((x as usize, y as usize))
 }

@@ -25,6 +25,7 @@ pub(crate) const AFTER_HELP: &str = "Examples:\n  \
     sixfold teach mug --photographs photographs\n  \
     sixfold teach mug --photographs colour --depth depth --depth-scale 1 --camera camera.json\n  \
     sixfold teach mug --photographs photographs --no-board --length 0.12 --ends a.jpg:812,640:1010,655 b.jpg:700,655:934,628\n  \
+    sixfold teach mug --photographs image.png --depth depth.png --depth-scale 1 --camera camera.json --no-board   # one view\n  \
     sixfold teach mug --photographs photographs.json      # with poses, masks and depth from elsewhere\n  \
     sixfold teach mug --train                             # a network for the object taught before\n  \
     sixfold estimate --rgb image.png --camera camera.json --object mug --method views --out out\n\n\
@@ -34,8 +35,8 @@ pub(crate) const AFTER_HELP: &str = "Examples:\n  \
 pub(crate) struct TeachArguments {
     /// Name of the object: letters, digits, - and _
     pub name: String,
-    /// Photographs of the object, on the board unless --no-board (PNG, JPEG), or folders of them: 8 to 40, from all sides; or one
-    /// JSON file that lists photographs with the object's pose in each, masks and depth (docs/teach.md), without a board
+    /// Photographs of the object, on the board unless --no-board (PNG, JPEG), or folders of them: 8 to 40, from all sides; one is
+    /// enough with --depth, --camera and --no-board. Or one JSON file that lists photographs with the object's pose in each, masks and depth (docs/teach.md), without a board
     #[arg(long, required_unless_present = "train", num_args = 1.., value_name = "DIR")]
     pub photographs: Vec<PathBuf>,
     /// Depth images from the same viewpoints (PNG, 16 bit), or folders of them, in the order of the photographs' names

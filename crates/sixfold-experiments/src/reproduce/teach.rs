@@ -24,7 +24,9 @@ use sixfold_shell::output::{JsonArguments, report, write_atomically};
 use sixfold_shell::progress::{Progress, check_interrupt};
 use sixfold_teach::simulation::{SimulatedCapture, SimulationOptions, ground_of, patterned};
 
-use super::teach_photographs::{board_from_world, errors, marked_length, teaching, write_photographs};
+use super::teach_photographs::{
+    board_from_world, errors, marked_length, teaching, write_depth_images, write_photographs,
+};
 
 pub(super) const AFTER_HELP: &str = "Example:\n  \
     sixfold reproduce teach --list benches/teach-objects.json --meshes DIR --ground photograph.jpg --out out/reproduce-teach\n\n\
@@ -60,9 +62,39 @@ pub(crate) struct ReproduceTeachArguments {
     /// accurate to a pixel. No new images are searched
     #[arg(long)]
     no_board: bool,
+    /// Each photograph has a depth image, of a simulated RealSense
+    #[arg(long)]
+    depth: bool,
+    /// One photograph with depth from a known camera, without a board
+    #[arg(long, conflicts_with_all = ["photographs", "no_board"])]
+    one_view: bool,
     /// Folder for the results
     #[arg(long, value_name = "DIR", default_value = "out/reproduce-teach")]
     out: PathBuf,
+}
+
+impl ReproduceTeachArguments {
+    fn photographs(&self) -> usize {
+        if self.one_view { 1 } else { self.photographs }
+    }
+
+    fn depth(&self) -> bool {
+        self.depth || self.one_view
+    }
+
+    fn no_board(&self) -> bool {
+        self.no_board || self.one_view
+    }
+
+    /// Folder of an object; each kind of photographs has its own.
+    fn files(&self, name: &str) -> PathBuf {
+        let kind = match (self.one_view, self.depth) {
+            (true, _) => "-one-view",
+            (false, true) => "-depth",
+            (false, false) => "",
+        };
+        self.out.join(format!("{name}{kind}"))
+    }
 }
 
 #[derive(Deserialize)]
@@ -81,6 +113,9 @@ struct Row {
     seed: u64,
     #[serde(default)]
     no_board: bool,
+    /// Whether the photographs had depth images.
+    #[serde(default)]
+    depth: bool,
     /// How many of the photographs have a pose.
     #[serde(default)]
     with_pose: usize,
@@ -138,7 +173,7 @@ pub(super) fn run(a: &ReproduceTeachArguments, json: &JsonArguments) -> Result<O
     let mut objects = vec![];
     for (i, entry) in entries.iter().enumerate() {
         check_interrupt("finished objects are kept; give the same command to continue")?;
-        let file = a.out.join(format!("{}.json", entry.name));
+        let file = a.files(&entry.name).with_extension("json");
         let row = match kept(&file, a) {
             Some(row) => row,
             None => {
@@ -175,7 +210,11 @@ pub(super) fn run(a: &ReproduceTeachArguments, json: &JsonArguments) -> Result<O
 
 fn kept(file: &Path, a: &ReproduceTeachArguments) -> Option<Row> {
     let row: Row = serde_json::from_str(&std::fs::read_to_string(file).ok()?).ok()?;
-    (row.photographs == a.photographs && row.seed == a.seed && row.no_board == a.no_board).then_some(row)
+    (row.photographs == a.photographs()
+        && row.seed == a.seed
+        && row.no_board == a.no_board()
+        && row.depth == a.depth())
+    .then_some(row)
 }
 
 /// A mesh with colours: smooth patches if it has none.
@@ -201,18 +240,22 @@ fn measured(
     others: &[&Mesh],
     ground: &RgbImage,
 ) -> Result<Row> {
-    let options = SimulationOptions { photographs: a.photographs, ..SimulationOptions::default() };
+    let options = SimulationOptions { photographs: a.photographs(), ..SimulationOptions::default() };
     let cloth = patterned(2048, a.seed);
-    let capture = if a.no_board {
+    let capture = if a.no_board() {
         SimulatedCapture::without_board(mesh, (&cloth, CLOTH), ground, &options, a.seed)
     } else {
         SimulatedCapture::new(mesh, &Board::new(Paper::A4), ground, &options, a.seed)
     };
-    let length = a.no_board.then(|| marked_length(&capture, &options.camera, a.seed));
-    let files = a.out.join(name);
+    let length = (a.no_board && !a.one_view).then(|| marked_length(&capture, &options.camera, a.seed));
+    let files = a.files(name);
     write_photographs(&capture, &files)?;
+    if a.depth() {
+        write_depth_images(&capture, &files)?;
+    }
     let start = Instant::now();
-    let teaching = teaching(&files, a.photographs, length)?;
+    let camera = a.one_view.then_some(options.camera);
+    let teaching = teaching(&files, a.photographs(), length, camera)?;
     let taught = teaching.mesh()?;
     let noise = SymmetryOptions { noise: 0.004 * taught.diameter(), ..SymmetryOptions::default() };
     let sure = sure_symmetries(&find_symmetries(&taught, &noise)?, true);
@@ -222,7 +265,8 @@ fn measured(
     let rows = facts.board_from_object;
     let world_from_taught = Pose::from_translation(Vec3::new(rows[0][3], rows[1][3], rows[2][3]));
     // Without a board the world's frame is arbitrary: align the cameras with their true poses.
-    let board_from_world = if a.no_board { board_from_world(&teaching, &capture)? } else { Pose::identity() };
+    let board_from_world =
+        if a.no_board() { board_from_world(&teaching, &capture)? } else { Pose::identity() };
     let board_from_taught = compose(&board_from_world, &world_from_taught);
     let errors = errors(&teaching, &capture, &board_from_world)?;
     let there = mesh.transformed(&capture.board_from_object);
@@ -246,9 +290,10 @@ fn measured(
     let [found_auto_with_true_mesh, _] = search(&auto, &known, &Pose::identity())?;
     Ok(Row {
         name: name.to_owned(),
-        photographs: a.photographs,
+        photographs: a.photographs(),
         seed: a.seed,
-        no_board: a.no_board,
+        no_board: a.no_board(),
+        depth: a.depth(),
         with_pose: errors.with_pose,
         diameter_mm: 1000.0 * mesh.diameter(),
         camera_mm: errors.camera_mm,

@@ -5,6 +5,8 @@ use std::path::Path;
 use anyhow::Result;
 use sixfold_geometry::random::{normal, stream};
 use sixfold_geometry::{Camera, Pose, RgbImage, Vec2, Vec3, kabsch, stats::median};
+use sixfold_io::write_depth;
+use sixfold_render::DepthSensor;
 use sixfold_shell::output::write_atomically;
 use sixfold_teach::simulation::SimulatedCapture;
 use sixfold_teach::{KnownLength, SalientSegmenter, ShapeOptions, TeachOptions, Teaching, World};
@@ -21,14 +23,35 @@ pub(super) fn write_photographs(capture: &SimulatedCapture<'_>, files: &Path) ->
     Ok(())
 }
 
-/// The object taught from them: on the board, or without one if a length is given.
-pub(super) fn teaching(files: &Path, photographs: usize, length: Option<KnownLength>) -> Result<Teaching> {
-    let world = if length.is_some() { World::Features } else { World::Board };
-    let options = TeachOptions { world, ..TeachOptions::default() };
+/// Metres for a unit of the depth images.
+const DEPTH_UNIT: f64 = 1e-4;
+
+/// Writes a simulated RealSense's depth images for the photographs.
+pub(super) fn write_depth_images(capture: &SimulatedCapture<'_>, files: &Path) -> Result<()> {
+    for i in 0..capture.camera_from_board.len() {
+        let Some(depth) = capture.measured_depth(i, &DepthSensor::realsense()) else { break };
+        write_depth(&files.join("depth").join(format!("{i:02}.png")), &depth, DEPTH_UNIT)?;
+    }
+    Ok(())
+}
+
+/// The object taught from them: on the board, or without one if a length or the camera is given; with depth images if there are any.
+pub(super) fn teaching(
+    files: &Path,
+    photographs: usize,
+    length: Option<KnownLength>,
+    camera: Option<Camera>,
+) -> Result<Teaching> {
+    let world = if length.is_some() || camera.is_some() { World::Features } else { World::Board };
+    let options = TeachOptions { world, camera, ..TeachOptions::default() };
     let mut teaching = Teaching::open(files.join("teaching"), &options)?;
     for i in 0..photographs {
         let file = files.join("photographs").join(format!("{i:02}.jpg"));
         teaching.add_photograph(&format!("{i:02}.jpg"), &std::fs::read(&file)?)?;
+        let depth = files.join("depth").join(format!("{i:02}.png"));
+        if depth.exists() {
+            teaching.add_depth(i, &std::fs::read(&depth)?, DEPTH_UNIT)?;
+        }
     }
     let shape = ShapeOptions::default();
     teaching.set_length(length)?;
@@ -89,11 +112,14 @@ pub(super) fn marked_length(capture: &SimulatedCapture<'_>, camera: &Camera, see
     KnownLength { metres: (first - second).norm(), ends: [0, third, 2 * third].map(&mut marked).to_vec() }
 }
 
-/// The rigid motion (without scale) that best aligns the cameras with their true poses.
+/// The rigid motion (without scale) that best aligns the cameras with their true poses; that of a single camera.
 pub(super) fn board_from_world(teaching: &Teaching, capture: &SimulatedCapture<'_>) -> Result<Pose> {
     let both = capture.camera_from_board.iter().enumerate().filter_map(|(i, truth)| {
         Some((teaching.camera_from_board(i)?.inverse().translation(), truth.inverse().translation()))
     });
+    if let ([truth], Some(found)) = (&capture.camera_from_board[..], teaching.camera_from_board(0)) {
+        return Ok(compose(&truth.inverse(), &found));
+    }
     let (found, truth): (Vec<Vec3>, Vec<Vec3>) = both.unzip();
     Ok(kabsch(&found, &truth, None)?)
 }

@@ -1,0 +1,139 @@
+//! Objects taught from a single photograph with depth: the table, the mask and the hidden side are found or assumed.
+
+use sixfold_board::{Board, Paper};
+use sixfold_geometry::{Camera, DepthImage, Image, KdTree, Pose, RgbImage, Vec3};
+use sixfold_mesh::Mesh;
+use sixfold_render::DepthSensor;
+use sixfold_teach::simulation::{SimulatedCapture, SimulationOptions};
+use sixfold_teach::{SalientSegmenter, ShapeOptions, TeachError, TeachOptions, Teaching, World};
+
+fn cuboid(low: [f64; 3], high: [f64; 3]) -> Mesh {
+    let corner = |i: usize| {
+        let pick = |k: usize| if (i >> k) & 1 == 0 { low[k] } else { high[k] };
+        Vec3::new(pick(0), pick(1), pick(2))
+    };
+    let quads = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]];
+    let faces = quads.iter().flat_map(|[a, b, c, d]| [[*a, *b, *c], [*a, *c, *d]]).collect();
+    Mesh::new((0..8).map(corner).collect(), faces).unwrap()
+}
+
+/// A box with a ledge on one side, which has no counterpart on the other.
+fn carton() -> Mesh {
+    let parts =
+        [cuboid([-0.03, -0.05, 0.0], [0.03, 0.05, 0.12]), cuboid([-0.01, -0.07, 0.05], [0.01, -0.05, 0.07])];
+    let colors = [[200, 60, 40], [40, 110, 170]];
+    let painted = parts
+        .iter()
+        .zip(colors)
+        .map(|(mesh, color)| mesh.clone().with_colors(vec![color; mesh.vertices().len()]).unwrap());
+    Mesh::merged(&painted.collect::<Vec<_>>()).unwrap()
+}
+
+fn options() -> SimulationOptions {
+    let camera =
+        Camera { fx: 620.0, fy: 618.0, cx: 322.0, cy: 238.0, width: 640, height: 480, distortion: None };
+    SimulationOptions { photographs: 1, camera, ..SimulationOptions::default() }
+}
+
+fn png(image: &RgbImage) -> Vec<u8> {
+    let (w, h) = image.size();
+    let copy =
+        image::RgbImage::from_fn(w as u32, h as u32, |x, y| image::Rgb(image[(x as usize, y as usize)]));
+    let mut bytes = std::io::Cursor::new(vec![]);
+    copy.write_to(&mut bytes, image::ImageFormat::Png).unwrap();
+    bytes.into_inner()
+}
+
+fn depth_png(depth: &DepthImage) -> Vec<u8> {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("depth.png");
+    sixfold_io::write_depth(&path, depth, 1e-4).unwrap();
+    std::fs::read(&path).unwrap()
+}
+
+/// A teaching with one photograph and its depth, without a board, up to the poses.
+fn opened(folder: &std::path::Path, image: &RgbImage, depth: &DepthImage) -> Result<Teaching, TeachError> {
+    let options =
+        TeachOptions { camera: Some(options().camera), world: World::Features, ..TeachOptions::default() };
+    let mut teaching = Teaching::open(folder, &options)?;
+    teaching.add_photograph("view.png", &png(image))?;
+    teaching.add_depth(0, &depth_png(depth), 1e-4)?;
+    teaching.locate(&())?;
+    Ok(teaching)
+}
+
+fn shape() -> ShapeOptions {
+    ShapeOptions { fine_cells: 90, faces: 6000, ..ShapeOptions::default() }
+}
+
+fn taught(
+    folder: &std::path::Path,
+    capture: &SimulatedCapture<'_>,
+    depth: &DepthImage,
+) -> Result<Teaching, TeachError> {
+    let mut teaching = opened(folder, &capture.photograph(0).unwrap(), depth)?;
+    teaching.find_masks(&SalientSegmenter::shipped().unwrap(), &shape(), &())?;
+    teaching.reconstruct(&shape(), &())?;
+    Ok(teaching)
+}
+
+fn compose(a: &Pose, b: &Pose) -> Pose {
+    Pose::new(a.rotation() * b.rotation(), a.transform_point(&b.translation()))
+}
+
+#[test]
+fn the_hidden_side_of_a_carton_is_assumed_and_its_ledge_kept() {
+    let (mesh, ground, options) = (carton(), Image::filled(64, 64, [90, 85, 70]), options());
+    let capture = SimulatedCapture::new(&mesh, &Board::new(Paper::A4), &ground, &options, 6);
+    let folder = tempfile::tempdir().unwrap();
+    let depth = capture.measured_depth(0, &DepthSensor::realsense()).unwrap();
+    let teaching = taught(folder.path(), &capture, &depth).unwrap();
+    let facts = *teaching.shape().unwrap();
+    assert!(facts.one_side && facts.unseen > 0.4, "{facts:?}");
+    // The world: z up from the table.
+    let [x, y, z] = [0, 1, 2].map(|k| facts.board_from_object[k][3]);
+    let in_world = teaching.mesh().unwrap().transformed(&Pose::from_translation(Vec3::new(x, y, z)));
+    let (low, high) = in_world.bounding_box();
+    assert!(low.z.abs() < 0.004 && (high.z - 0.12).abs() < 0.006, "{low} {high}");
+    // Against the truth, in the camera's frame.
+    let found = in_world.transformed(&teaching.camera_from_board(0).unwrap());
+    let camera_from_true = compose(&capture.camera_from_board[0], &capture.board_from_object);
+    let there = mesh.transformed(&camera_from_true);
+    let points = |mesh: &Mesh| mesh.sample_surface(20_000, 1).points;
+    let mean = |from: &[Vec3], to: &[Vec3]| {
+        let tree = KdTree::new(to);
+        from.iter().filter_map(|p| tree.nearest(p)).map(|n| n.distance).sum::<f64>() / from.len() as f64
+    };
+    let (a, b) = (points(&found), points(&there));
+    let errors = [mean(&a, &b), mean(&b, &a)];
+    assert!(errors[0] < 0.004 && errors[1] < 0.006, "{errors:?}");
+    // The end of the ledge, which is in sight.
+    let end = camera_from_true.transform_point(&Vec3::new(0.0, -0.07, 0.07));
+    let shown = KdTree::new(&a).nearest(&end).unwrap().distance;
+    assert!(shown < 0.008, "{shown}");
+}
+
+#[test]
+fn one_depth_image_that_shows_no_object_is_refused_with_the_reason() {
+    let folder = tempfile::tempdir().unwrap();
+    let grey = Image::filled(640, 480, [90; 3]);
+    // Noise of 40 cm: no plane has enough points.
+    let rough =
+        Image::from_fn(640, 480, |x, y| 0.5 + 0.4 * ((x * 7919 + y * 104_729) % 1000) as f32 / 1000.0);
+    let error = opened(&folder.path().join("a"), &grey, &rough).unwrap_err().to_string();
+    assert!(error.contains("view.png") && error.contains("no table"), "{error}");
+    let flat = Image::filled(640, 480, 0.6);
+    let mut teaching = opened(&folder.path().join("b"), &grey, &flat).unwrap();
+    let error =
+        teaching.find_masks(&SalientSegmenter::shipped().unwrap(), &shape(), &()).unwrap_err().to_string();
+    assert!(error.contains("nothing stands on the table"), "{error}");
+    // Two boxes, and nothing that says which is meant.
+    let two = Image::from_fn(640, 480, |x, y| {
+        let inside = |low: usize| (low..low + 120).contains(&x) && (180..300).contains(&y);
+        if inside(120) || inside(400) { 0.55 } else { 0.6 }
+    });
+    let mut teaching = opened(&folder.path().join("c"), &grey, &two).unwrap();
+    let error =
+        teaching.find_masks(&SalientSegmenter::shipped().unwrap(), &shape(), &()).unwrap_err().to_string();
+    assert!(error.contains("2 objects") && error.contains("masks"), "{error}");
+}
