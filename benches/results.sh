@@ -343,8 +343,11 @@ part_auto() {
 
 # Objects taught from simulated photographs.
 part_teach() {
-    typed "sixfold reproduce teach --list benches/teach-objects.json --meshes DIR/meshes --ground DIR/backgrounds/103041.jpg --out OUT/teach --json OUT/teach.json"
-    freeze teach 7 taught=teach.json
+    local common="sixfold reproduce teach --list benches/teach-objects.json --meshes DIR/meshes --ground DIR/backgrounds/103041.jpg --out OUT/teach"
+    typed "$common --json OUT/teach.json"
+    typed "$common --depth --json OUT/teach-depth.json"
+    typed "$common --one-view --json OUT/teach-one-view.json"
+    freeze teach 7 taught=teach.json with_depth=teach-depth.json one_view=teach-one-view.json
 }
 
 # Poses from colour in ground-truth boxes and in a detector's.
