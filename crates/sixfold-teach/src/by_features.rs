@@ -1,7 +1,7 @@
 //! The first step of a teaching without a board: features of all photographs, then their poses; and the known length that gives the
 //! scale.
 
-use sixfold_geometry::{Camera, DepthImage, Progress};
+use sixfold_geometry::{DepthImage, Progress};
 use sixfold_io::{ImageFile, read_depth, read_rgb};
 use sixfold_nn::keypoints::KeypointFinder;
 
@@ -54,10 +54,10 @@ impl Teaching {
         if length.is_none() && used.iter().all(|i| self.photographs()[*i].depth.is_none()) {
             return Err(TeachError::NoScale);
         }
-        if let ([number], Some(camera)) = (&used[..], self.known.state.given_camera)
+        if let [number] = used[..]
             && let Some(depth) = depth_of(0)?
         {
-            return self.locate_above_table(*number, &depth, &camera);
+            return self.locate_above_table(number, &depth);
         }
         let finder = KeypointFinder::shipped().map_err(|e| TeachError::Masks(e.into()))?;
         let mut seen = vec![];
@@ -79,21 +79,16 @@ impl Teaching {
     }
 
     /// The pose of a single photograph above the table that its depth shows.
-    fn locate_above_table(
-        &mut self,
-        number: usize,
-        depth: &DepthImage,
-        camera: &Camera,
-    ) -> Result<(), TeachError> {
+    fn locate_above_table(&mut self, number: usize, depth: &DepthImage) -> Result<(), TeachError> {
+        let file = self.photographs()[number].name.clone();
         let (width, height) = depth.size();
+        let Some(camera) = self.known.state.given_camera else { return Err(TeachError::NoCamera { file }) };
         if (camera.width, camera.height) != (width, height) {
             let (camera_width, camera_height) = (camera.width, camera.height);
             return Err(TeachError::CameraSize { width, height, camera_width, camera_height });
         }
-        let file = self.photographs()[number].name.clone();
-        let pose = camera_above_table(depth, camera).ok_or(TeachError::NoTable { file })?;
-        let found =
-            PutTogether { camera: *camera, camera_from_world: vec![Ok(pose)], floor: Some(0.0), rms: 0.0 };
+        let pose = camera_above_table(depth, &camera).ok_or(TeachError::NoTable { file })?;
+        let found = PutTogether { camera, camera_from_world: vec![Ok(pose)], floor: Some(0.0), rms: 0.0 };
         self.keep_poses(&[number], found)
     }
 

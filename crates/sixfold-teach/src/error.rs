@@ -142,6 +142,12 @@ pub enum TeachError {
     /// A depth image from one side that does not show the object.
     #[error("depth from one side: {0}")]
     OneDepth(#[from] ViewError),
+    /// One photograph without a board, with depth, of an unknown camera.
+    #[error("{file}: a single photograph with depth needs its camera: give --camera")]
+    NoCamera {
+        /// The photograph.
+        file: String,
+    },
     /// One photograph without a board whose depth image shows no table.
     #[error(
         "{file}: its depth image shows no table: expected an object that stands on a plane, or give poses and masks (docs/teach.md)"

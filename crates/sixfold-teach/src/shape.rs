@@ -173,15 +173,15 @@ pub fn segment(
     options: &ShapeOptions,
     progress: &dyn Progress,
 ) -> Result<Segmentation, TeachError> {
+    check_count(capture)?;
+    if (capture.volume.is_none() || capture.photographs.len() == 1)
+        && let Some(found) = one_side::segmented(capture, segmenter, options)?
+    {
+        return Ok(found);
+    }
     let searched = match capture.volume {
         Some(volume) => volume,
-        None => {
-            check_count(capture)?;
-            if let Some(found) = one_side::segmented(capture, segmenter, options)? {
-                return Ok(found);
-            }
-            searched_volume(capture, segmenter, options)?
-        }
+        None => searched_volume(capture, segmenter, options)?,
     };
     check_photographs(capture, &searched)?;
     if let Some(given) = given_masks(capture, &searched) {

@@ -53,8 +53,17 @@ fn depth_png(depth: &DepthImage) -> Vec<u8> {
 
 /// A teaching with one photograph and its depth, without a board, up to the poses.
 fn opened(folder: &std::path::Path, image: &RgbImage, depth: &DepthImage) -> Result<Teaching, TeachError> {
-    let options =
-        TeachOptions { camera: Some(options().camera), world: World::Features, ..TeachOptions::default() };
+    opened_in(World::Features, Some(options().camera), folder, image, depth)
+}
+
+fn opened_in(
+    world: World,
+    camera: Option<Camera>,
+    folder: &std::path::Path,
+    image: &RgbImage,
+    depth: &DepthImage,
+) -> Result<Teaching, TeachError> {
+    let options = TeachOptions { camera, world, ..TeachOptions::default() };
     let mut teaching = Teaching::open(folder, &options)?;
     teaching.add_photograph("view.png", &png(image))?;
     teaching.add_depth(0, &depth_png(depth), 1e-4)?;
@@ -111,6 +120,24 @@ fn the_hidden_side_of_a_carton_is_assumed_and_its_ledge_kept() {
     let end = camera_from_true.transform_point(&Vec3::new(0.0, -0.07, 0.07));
     let shown = KdTree::new(&a).nearest(&end).unwrap().distance;
     assert!(shown < 0.008, "{shown}");
+}
+
+#[test]
+fn one_photograph_with_depth_on_the_board_is_enough_if_the_camera_is_known() {
+    let (mesh, ground, options) = (carton(), Image::filled(64, 64, [90, 85, 70]), options());
+    let capture = SimulatedCapture::new(&mesh, &Board::new(Paper::A4), &ground, &options, 6);
+    let folder = tempfile::tempdir().unwrap();
+    let depth = capture.measured_depth(0, &DepthSensor::realsense()).unwrap();
+    let image = capture.photograph(0).unwrap();
+    let mut teaching =
+        opened_in(World::Board, Some(options.camera), &folder.path().join("a"), &image, &depth).unwrap();
+    teaching.find_masks(&SalientSegmenter::shipped().unwrap(), &shape(), &()).unwrap();
+    teaching.reconstruct(&shape(), &()).unwrap();
+    assert!(teaching.shape().unwrap().one_side);
+    let (low, high) = teaching.mesh().unwrap().bounding_box();
+    assert!((high.z - low.z - 0.12).abs() < 0.006 && (high - low).xy().max() < 0.15, "{low} {high}");
+    let error = opened_in(World::Features, None, &folder.path().join("b"), &image, &depth).unwrap_err();
+    assert!(error.to_string().contains("view.png") && error.to_string().contains("--camera"), "{error}");
 }
 
 #[test]
