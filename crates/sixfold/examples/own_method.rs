@@ -52,17 +52,14 @@ impl PoseEstimator for Median {
         let object: &Centre = downcast(object, METHOD)?;
         let points = &query.depth_region(METHOD)?.cloud().points;
         let median_of = |k: usize| median(&mut points.iter().map(|p| p[k]).collect::<Vec<f64>>());
-        let (Some(x), Some(y), Some(z)) = (median_of(0), median_of(1), median_of(2)) else {
-            return Ok(vec![]);
-        };
+        let [Some(x), Some(y), Some(z)] = [0, 1, 2].map(median_of) else { return Ok(vec![]) };
         let pose = Pose::from_translation(Vec3::new(x, y, z) - object.centre);
         Ok(vec![PoseEstimate::new(pose, 1.0)])
     }
 }
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
-    let demo = concat!(env!("CARGO_MANIFEST_DIR"), "/../../data/demo");
-    let dataset = BopDataset::open(demo.as_ref(), "test")?;
+    let dataset = BopDataset::open(concat!(env!("CARGO_MANIFEST_DIR"), "/../../data/demo").as_ref(), "test")?;
     let targets = dataset.object_targets(&dataset.targets(None)?)?;
     let folder = tempfile::tempdir()?;
     let results = folder.path().join("median_demo-test.csv");

@@ -318,6 +318,18 @@ pub(crate) fn of_teach(error: &TeachError) -> ApiError {
             "depth images from the viewpoints of the photographs",
             "check depth_scale, or send length and ends",
         ),
+        TeachError::OneDepth(_) | TeachError::NoTable { .. } => in_fields(
+            "depth",
+            error,
+            "the depth image of one object that stands alone on a table",
+            "mark the object with a mask, or add photographs from other sides",
+        ),
+        TeachError::NoCamera { .. } => in_fields(
+            "camera",
+            error,
+            "the camera of a single photograph with depth",
+            "send the file field camera, or add photographs from other sides",
+        ),
         TeachError::Ends { .. } => {
             in_fields("ends", error, marks, "correct the marks, or mark the ends in more photographs")
         }

@@ -285,6 +285,28 @@ fn depth_images_belong_to_the_photographs_by_their_names() {
 }
 
 #[test]
+fn one_photograph_with_depth_needs_no_board() {
+    let truth = photographs();
+    let server = TestServer::new();
+    let one = |depth: &[u8]| {
+        with_camera(Form::default().text("name", "one").text("without_board", "true"))
+            .text("depth_scale", "1")
+            .file("photographs", "0.png", &truth.files[0])
+            .file("depth", "0.png", depth)
+    };
+    let teaching = server.post("/v1/teachings", &one(&truth.depth[0])).expect(201).json();
+    let done = server.result(&job_of(&teaching)).expect(200).json();
+    assert_eq!(done["photographs"], 1, "{done}");
+    let diameter = done["mesh"]["diameter"].as_f64().unwrap();
+    assert!((diameter - 0.147).abs() < 0.02 && done["unseen"].as_f64().unwrap() > 0.3, "{done}");
+    let noise =
+        Image::from_fn(480, 360, |x, y| 0.5 + 0.4 * ((x * 7919 + y * 104_729) % 1000) as f32 / 1000.0);
+    let (_, problem) = failed(&server, &one(&depth_png(&noise)));
+    assert_eq!(problem["field"], "depth", "{problem}");
+    assert!(problem["error"].as_str().unwrap().contains("no table"), "{problem}");
+}
+
+#[test]
 fn a_teaching_survives_a_kill_and_a_cancelled_one_resumes() {
     let folder = tempfile::tempdir().unwrap();
     let (mut process, address) = to_be_killed(folder.path());
