@@ -12,7 +12,7 @@ use sixfold_grasp::{
 };
 
 use crate::error::TeachError;
-use crate::given::{certain, salient_fraction};
+use crate::given::salient_fraction;
 use crate::grid::Grid;
 use crate::shape::{APART, Capture, Segmentation, ShapeOptions};
 use crate::silhouette::Segmenter;
@@ -51,9 +51,11 @@ impl<'a> OneSide<'a> {
     /// `None` if the photographs are from several sides or without depth. `masks` are in the photographs' pixels without lens
     /// distortion.
     pub fn of(capture: &'a Capture, masks: &[Option<Mask>]) -> Result<Option<OneSide<'a>>, TeachError> {
-        let used: Vec<(&PosedPhotograph, &Mask)> =
-            capture.photographs.iter().zip(masks).filter_map(|(p, m)| Some((p, m.as_ref()?))).collect();
-        let points = |(p, mask): &(&PosedPhotograph, &Mask)| {
+        let shown =
+            |(p, mask): (&'a PosedPhotograph, &Option<Mask>)| Some((p, not_hidden(p, mask.as_ref()?)));
+        let used: Vec<(&PosedPhotograph, Mask)> =
+            capture.photographs.iter().zip(masks).filter_map(shown).collect();
+        let points = |(p, mask): &(&PosedPhotograph, Mask)| {
             let depth = straight_depth(p)?;
             let shown = |i: &usize| mask.as_slice()[*i] && depth.as_slice()[*i] > 0.0;
             Some((0..mask.as_slice().len()).filter(shown).count())
@@ -61,7 +63,7 @@ impl<'a> OneSide<'a> {
         let counts: Option<Vec<usize>> = used.iter().map(points).collect();
         let Some(counts) = counts.filter(|_| !from_several_sides(&used)) else { return Ok(None) };
         let best = (0..used.len()).max_by_key(|i| (counts[*i], std::cmp::Reverse(*i)));
-        best.map(|best| OneSide::new(capture, used[best].0, used[best].1)).transpose()
+        best.map(|best| OneSide::new(capture, used[best].0, &used[best].1)).transpose()
     }
 
     fn new(
@@ -85,9 +87,12 @@ impl<'a> OneSide<'a> {
         let completed = complete_by_mirrors(&view, &CompletionOptions::default());
         let points: Vec<Vec3> =
             completed.cloud.points.iter().map(|p| world_from_camera.transform_point(p)).collect();
-        let low = points.iter().fold(Vec3::repeat(f64::INFINITY), |low, p| low.inf(p));
-        let high = points.iter().fold(Vec3::repeat(f64::NEG_INFINITY), |high, p| high.sup(p));
         let floor = view.table.map(|table| moved(&table, &world_from_camera));
+        // Something may occlude the lower part: the object reaches down to the table.
+        let feet = floor.iter().flat_map(|floor| points.iter().map(|p| p - floor.normal * floor.distance(p)));
+        let all = || points.iter().copied().chain(feet.clone());
+        let low = all().fold(Vec3::repeat(f64::INFINITY), |low, p| low.inf(&p));
+        let high = all().fold(Vec3::repeat(f64::NEG_INFINITY), |high, p| high.sup(&p));
         let mirrors: Vec<Plane> =
             completed.planes.iter().map(|plane| moved(plane, &world_from_camera)).collect();
         let extents = floor.map_or_else(Vec::new, |floor| {
@@ -193,7 +198,7 @@ fn moved(plane: &Plane, pose: &Pose) -> Plane {
 }
 
 /// Whether the object is seen from directions at least [`APART`] degrees apart.
-fn from_several_sides(used: &[(&PosedPhotograph, &Mask)]) -> bool {
+fn from_several_sides(used: &[(&PosedPhotograph, Mask)]) -> bool {
     let Some(centre) = used.iter().find_map(|(p, mask)| centre_of(p, mask)) else { return true };
     let towards: Vec<Vec3> = used
         .iter()
@@ -201,6 +206,14 @@ fn from_several_sides(used: &[(&PosedPhotograph, &Mask)]) -> bool {
         .collect();
     let least = APART.to_radians().cos();
     towards.iter().any(|a| towards.iter().any(|b| a.dot(b) <= least))
+}
+
+/// A mask without the pixels where something may occlude the object.
+fn not_hidden(photograph: &PosedPhotograph, mask: &Mask) -> Mask {
+    let Some(hidden) = &photograph.hidden else { return mask.clone() };
+    Image::from_fn(mask.width(), mask.height(), |x, y| {
+        mask[(x, y)] && !hidden.get(x, y).copied().unwrap_or(false)
+    })
 }
 
 /// The mean of the measured points in a mask.
@@ -238,7 +251,8 @@ pub(crate) fn segmented(
     if capture.photographs.iter().any(|p| p.depth.is_none()) {
         return Ok(None);
     }
-    let given: Option<Vec<Option<Mask>>> = capture.photographs.iter().map(|p| certain(p).map(Some)).collect();
+    let given: Option<Vec<Option<Mask>>> =
+        capture.photographs.iter().map(|p| p.mask.as_deref().cloned().map(Some)).collect();
     let masks = match (given, &capture.photographs[..]) {
         (Some(given), _) => given,
         (None, [photograph]) => vec![Some(object_on_table(photograph, segmenter, options)?)],

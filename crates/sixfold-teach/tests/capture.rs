@@ -12,15 +12,9 @@ use sixfold_teach::{
     TeachError, TeachOptions, Teaching, World, export_bop, photographs_of, reconstruct, segment,
 };
 
-fn cuboid(low: [f64; 3], high: [f64; 3]) -> Mesh {
-    let corner = |i: usize| {
-        let pick = |k: usize| if (i >> k) & 1 == 0 { low[k] } else { high[k] };
-        Vec3::new(pick(0), pick(1), pick(2))
-    };
-    let quads = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]];
-    let faces = quads.iter().flat_map(|[a, b, c, d]| [[*a, *b, *c], [*a, *c, *d]]).collect();
-    Mesh::new((0..8).map(corner).collect(), faces).unwrap()
-}
+use support::{cuboid, png};
+
+mod support;
 
 /// A body with a step: a wide foot and a narrow, off-centre head; no rotation maps it onto itself.
 fn body() -> Mesh {
@@ -70,15 +64,6 @@ fn photographs() -> &'static Photographs {
             masks: (0..10).map(|i| capture.mask(i).unwrap()).collect(),
         }
     })
-}
-
-fn png(image: &RgbImage) -> Vec<u8> {
-    let (w, h) = image.size();
-    let copy =
-        image::RgbImage::from_fn(w as u32, h as u32, |x, y| image::Rgb(image[(x as usize, y as usize)]));
-    let mut bytes = std::io::Cursor::new(vec![]);
-    copy.write_to(&mut bytes, image::ImageFormat::Png).unwrap();
-    bytes.into_inner()
 }
 
 /// The built-in network, with a count of its calls.

@@ -1,21 +1,20 @@
 //! Objects taught from a single photograph with depth: the table, the mask and the hidden side are found or assumed.
 
+use std::sync::Arc;
+
 use sixfold_board::{Board, Paper};
-use sixfold_geometry::{Camera, DepthImage, Image, KdTree, Pose, RgbImage, Vec3};
+use sixfold_geometry::{Camera, DepthImage, Image, KdTree, Mask, Plane, Pose, RgbImage, Vec3};
 use sixfold_mesh::Mesh;
 use sixfold_render::DepthSensor;
 use sixfold_teach::simulation::{SimulatedCapture, SimulationOptions};
-use sixfold_teach::{SalientSegmenter, ShapeOptions, TeachError, TeachOptions, Teaching, World};
+use sixfold_teach::{
+    Capture, PosedPhotograph, SalientSegmenter, ShapeOptions, TeachError, TeachOptions, Teaching, World,
+    reconstruct, segment,
+};
 
-fn cuboid(low: [f64; 3], high: [f64; 3]) -> Mesh {
-    let corner = |i: usize| {
-        let pick = |k: usize| if (i >> k) & 1 == 0 { low[k] } else { high[k] };
-        Vec3::new(pick(0), pick(1), pick(2))
-    };
-    let quads = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]];
-    let faces = quads.iter().flat_map(|[a, b, c, d]| [[*a, *b, *c], [*a, *c, *d]]).collect();
-    Mesh::new((0..8).map(corner).collect(), faces).unwrap()
-}
+use support::{cuboid, png};
+
+mod support;
 
 /// A box with a ledge on one side, which has no counterpart on the other.
 fn carton() -> Mesh {
@@ -33,15 +32,6 @@ fn options() -> SimulationOptions {
     let camera =
         Camera { fx: 620.0, fy: 618.0, cx: 322.0, cy: 238.0, width: 640, height: 480, distortion: None };
     SimulationOptions { photographs: 1, camera, ..SimulationOptions::default() }
-}
-
-fn png(image: &RgbImage) -> Vec<u8> {
-    let (w, h) = image.size();
-    let copy =
-        image::RgbImage::from_fn(w as u32, h as u32, |x, y| image::Rgb(image[(x as usize, y as usize)]));
-    let mut bytes = std::io::Cursor::new(vec![]);
-    copy.write_to(&mut bytes, image::ImageFormat::Png).unwrap();
-    bytes.into_inner()
 }
 
 fn depth_png(depth: &DepthImage) -> Vec<u8> {
@@ -120,6 +110,37 @@ fn the_hidden_side_of_a_carton_is_assumed_and_its_ledge_kept() {
     let end = camera_from_true.transform_point(&Vec3::new(0.0, -0.07, 0.07));
     let shown = KdTree::new(&a).nearest(&end).unwrap().distance;
     assert!(shown < 0.008, "{shown}");
+}
+
+#[test]
+fn depth_of_what_stands_before_the_object_is_not_its_own() {
+    let (mesh, ground, options) = (carton(), Image::filled(64, 64, [90, 85, 70]), options());
+    let capture = SimulatedCapture::new(&mesh, &Board::new(Paper::A4), &ground, &options, 6);
+    let (mask, mut depth) = (capture.mask(0).unwrap(), capture.depth(0).unwrap());
+    let [x0, y0, width, height] = mask.bounding_box().unwrap();
+    // A bar 10 cm before the lower third of the object.
+    let hidden = Mask::from_fn(640, 480, |x, y| {
+        (x0..x0 + width).contains(&x) && (y0 + 2 * height / 3..y0 + height).contains(&y)
+    });
+    for (z, hidden) in depth.as_mut_slice().iter_mut().zip(hidden.as_slice()) {
+        *z -= if *hidden { 0.1 } else { 0.0 };
+    }
+    let photograph = PosedPhotograph {
+        name: "view".to_owned(),
+        image: Arc::new(capture.photograph(0).unwrap()),
+        depth: Some(Arc::new(depth)),
+        mask: Some(Arc::new(mask)),
+        hidden: Some(Arc::new(hidden)),
+        camera: options.camera,
+        camera_from_world: capture.camera_from_board[0],
+    };
+    let floor = Plane { normal: Vec3::z(), offset: 0.0 };
+    let capture = Capture::without_board(vec![photograph], Some(floor));
+    let found = segment(&capture, &SalientSegmenter::shipped().unwrap(), &shape(), &()).unwrap();
+    let made = reconstruct(&capture, &found, &shape(), &()).unwrap();
+    let (low, high) = made.mesh.transformed(&made.world_from_object).bounding_box();
+    assert!(made.one_side && low.z.abs() < 0.004 && (high.z - 0.12).abs() < 0.006, "{low} {high}");
+    assert!((high - low).xy().max() < 0.16, "{low} {high}");
 }
 
 #[test]
