@@ -176,7 +176,7 @@ pub enum StoreError {
     },
     /// The program was built without this kind of store.
     #[error(
-        "{place}: this program was built without the feature `{feature}`; build it with: cargo install --path crates/sixfold-cli --features {feature}"
+        "{place}: this program was built without the feature `{feature}`; build it with: cargo install --locked --path crates/sixfold-cli --features {feature}"
     )]
     Feature {
         /// The file, or the server without the password.

@@ -43,7 +43,7 @@ use std::process::ExitCode;
 
 /// The error message of a program built without the feature `networks`.
 pub const WITHOUT_NETWORKS: &str =
-    "this program was built without the feature networks: cargo install --path crates/sixfold-cli";
+    "this program was built without the feature networks: cargo install --locked --path crates/sixfold-cli";
 
 /// The exit status of a command that ran without an error.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

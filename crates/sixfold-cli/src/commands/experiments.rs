@@ -30,7 +30,7 @@ pub(crate) fn run() -> Result<Outcome> {
     let Some(program) = find() else {
         bail!(
             "this command is run by the program {PROGRAM}, which is neither beside this one nor on PATH: install it with \
-             `cargo install --path crates/{PROGRAM}`, or build it in a checkout with `cargo build --release -p {PROGRAM}`"
+             `cargo install --locked --path crates/{PROGRAM}`, or build it in a checkout with `cargo build --release -p {PROGRAM}`"
         )
     };
     let mut command = Command::new(&program);

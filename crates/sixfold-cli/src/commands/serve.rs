@@ -113,7 +113,7 @@ mod left_out {
 
     pub(crate) fn run(_: &ServeArguments) -> Result<Outcome> {
         bail!(
-            "this program was built without the feature serve: cargo install --path crates/sixfold-cli --features serve"
+            "this program was built without the feature serve: cargo install --locked --path crates/sixfold-cli --features serve"
         )
     }
 }

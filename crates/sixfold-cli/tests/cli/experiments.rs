@@ -60,7 +60,7 @@ fn without_the_other_program_it_explains_the_installation() {
     for command in COMMANDS {
         let failed = run(alone.path(), "/nowhere", command).expect(2);
         for words in [
-            "cargo install --path crates/sixfold-experiments",
+            "cargo install --locked --path crates/sixfold-experiments",
             "cargo build --release -p sixfold-experiments",
         ] {
             assert!(failed.stderr.contains(words), "{}", failed.stderr);
