@@ -24,6 +24,12 @@ impl Plane {
         self.normal.dot(p) - self.offset
     }
 
+    /// The mirror image of a point.
+    #[must_use]
+    pub fn mirrored(&self, p: &Vec3) -> Vec3 {
+        p - self.normal * (2.0 * self.distance(p))
+    }
+
     /// The same plane with its normal on the side of `point`.
     pub fn facing(self, point: &Vec3) -> Plane {
         if self.distance(point) < 0.0 { Plane { normal: -self.normal, offset: -self.offset } } else { self }

@@ -125,7 +125,7 @@ pub fn complete_by_mirrors(view: &GraspView, options: &CompletionOptions) -> Com
 fn judge(view: &GraspView, probes: &[Vec3], plane: &Plane, options: &CompletionOptions) -> Option<f64> {
     let (mut contradicted, mut supported, mut hidden) = (0.0, 0.0, 0.0);
     for p in probes {
-        match verdict(view, &mirror(plane, p), options.tolerance) {
+        match verdict(view, &plane.mirrored(p), options.tolerance) {
             Verdict::Contradicted => contradicted += 1.0,
             Verdict::Supported(off) => supported += 1.0 - off / options.tolerance,
             Verdict::Hidden => hidden += 1.0,
@@ -136,10 +136,6 @@ fn judge(view: &GraspView, probes: &[Vec3], plane: &Plane, options: &CompletionO
     // Hidden points agree with any plane, so they count less than measured ones.
     (fraction(contradicted) <= options.max_contradiction)
         .then(|| fraction(supported) + 0.5 * fraction(hidden) - 2.0 * fraction(contradicted))
-}
-
-fn mirror(plane: &Plane, p: &Vec3) -> Vec3 {
-    p - plane.normal * (2.0 * plane.distance(p))
 }
 
 fn verdict(view: &GraspView, p: &Vec3, tolerance: f64) -> Verdict {
@@ -221,7 +217,7 @@ fn add_mirrored(view: &GraspView, done: &mut CompletedObject, plane: &Plane, opt
     let mut points = vec![];
     let mut normals = vec![];
     for (p, n) in done.cloud.points.iter().zip(&done.cloud.normals) {
-        let q = mirror(plane, p);
+        let q = plane.mirrored(p);
         let verdict = verdict(view, &q, options.tolerance);
         let known = tree.nearest(&q).is_some_and(|near| near.distance < 0.006);
         if verdict == Verdict::Contradicted || known {

@@ -88,12 +88,14 @@ pub(crate) fn salient_fraction(
 
 /// The pixels that certainly show the object, in a photograph whose mask was given.
 pub(crate) fn certain(p: &PosedPhotograph) -> Option<Mask> {
-    let mask = p.mask.as_ref()?;
-    Some(match &p.hidden {
-        Some(hidden) => Image::from_fn(mask.width(), mask.height(), |x, y| {
-            mask[(x, y)] && !hidden.get(x, y).copied().unwrap_or(false)
-        }),
-        None => (**mask).clone(),
+    Some(not_hidden(p, p.mask.as_ref()?))
+}
+
+/// A mask without the pixels where something may occlude the object.
+pub(crate) fn not_hidden(p: &PosedPhotograph, mask: &Mask) -> Mask {
+    let Some(hidden) = &p.hidden else { return mask.clone() };
+    Image::from_fn(mask.width(), mask.height(), |x, y| {
+        mask[(x, y)] && !hidden.get(x, y).copied().unwrap_or(false)
     })
 }
 

@@ -6,13 +6,15 @@
 
 use rayon::prelude::*;
 use sixfold_geometry::nalgebra::{Rotation3, UnitQuaternion};
-use sixfold_geometry::{Camera, DepthImage, Image, Mask, Mat3, Plane, Pose, Vec2, Vec3, inpaint_depth};
+use sixfold_geometry::{
+    Camera, DepthImage, Image, Mask, Mat3, Plane, Pose, Vec2, Vec3, inpaint_depth, undistort_depth,
+};
 use sixfold_grasp::{
-    CompletionOptions, GraspView, ViewOptions, complete_by_mirrors, find_objects, find_table,
+    CompletionOptions, GraspView, ViewError, ViewOptions, complete_by_mirrors, find_objects, find_table,
 };
 
 use crate::error::TeachError;
-use crate::given::salient_fraction;
+use crate::given::{not_hidden, salient_fraction};
 use crate::grid::Grid;
 use crate::shape::{APART, Capture, Segmentation, ShapeOptions};
 use crate::silhouette::Segmenter;
@@ -51,27 +53,34 @@ impl<'a> OneSide<'a> {
     /// `None` if the photographs are from several sides or without depth. `masks` are in the photographs' pixels without lens
     /// distortion.
     pub fn of(capture: &'a Capture, masks: &[Option<Mask>]) -> Result<Option<OneSide<'a>>, TeachError> {
-        let shown =
-            |(p, mask): (&'a PosedPhotograph, &Option<Mask>)| Some((p, not_hidden(p, mask.as_ref()?)));
+        let shown = |(p, mask): (&'a PosedPhotograph, &Option<Mask>)| {
+            p.depth.as_ref()?;
+            Some((p, not_hidden(p, mask.as_ref()?)))
+        };
+        let given = masks.iter().filter(|mask| mask.is_some()).count();
         let used: Vec<(&PosedPhotograph, Mask)> =
             capture.photographs.iter().zip(masks).filter_map(shown).collect();
-        let points = |(p, mask): &(&PosedPhotograph, Mask)| {
-            let depth = straight_depth(p)?;
-            let shown = |i: &usize| mask.as_slice()[*i] && depth.as_slice()[*i] > 0.0;
-            Some((0..mask.as_slice().len()).filter(shown).count())
-        };
-        let counts: Option<Vec<usize>> = used.iter().map(points).collect();
-        let Some(counts) = counts.filter(|_| !from_several_sides(&used)) else { return Ok(None) };
-        let best = (0..used.len()).max_by_key(|i| (counts[*i], std::cmp::Reverse(*i)));
-        best.map(|best| OneSide::new(capture, used[best].0, &used[best].1)).transpose()
+        if used.len() < given || from_several_sides(&used)? {
+            return Ok(None);
+        }
+        let mut best: Option<(usize, &PosedPhotograph, &Mask, DepthImage)> = None;
+        for (photograph, mask) in &used {
+            let depth = straight_depth(photograph)?;
+            let pixels =
+                mask.as_slice().iter().zip(depth.as_slice()).filter(|(m, z)| **m && **z > 0.0).count();
+            if best.as_ref().is_none_or(|best| pixels > best.0) {
+                best = Some((pixels, photograph, mask, depth));
+            }
+        }
+        best.map(|(_, photograph, mask, depth)| OneSide::new(capture, photograph, mask, depth)).transpose()
     }
 
     fn new(
         capture: &Capture,
         photograph: &'a PosedPhotograph,
         mask: &Mask,
+        depth: DepthImage,
     ) -> Result<OneSide<'a>, TeachError> {
-        let depth = straight_depth(photograph).unwrap_or_else(|| mask.map(|_| 0.0));
         let camera = photograph.camera.without_distortion();
         let rough = GraspView::new(&depth, &camera, mask, &ViewOptions::default())?;
         let surface = cleaned(&rough, mask);
@@ -129,10 +138,9 @@ impl<'a> OneSide<'a> {
 
     /// The mirror images of a point.
     fn mirrored(&self, point: &Vec3) -> Vec<Vec3> {
-        let mirror = |p: &Vec3, plane: &Plane| p - plane.normal * (2.0 * plane.distance(p));
-        let mut all: Vec<Vec3> = self.mirrors.iter().map(|plane| mirror(point, plane)).collect();
-        if let [first, second] = self.mirrors[..] {
-            all.push(mirror(&mirror(point, &first), &second));
+        let mut all: Vec<Vec3> = self.mirrors.iter().map(|plane| plane.mirrored(point)).collect();
+        if let [first, second] = &self.mirrors[..] {
+            all.push(second.mirrored(&first.mirrored(point)));
         }
         all
     }
@@ -197,27 +205,26 @@ fn moved(plane: &Plane, pose: &Pose) -> Plane {
     Plane { normal, offset: plane.offset + normal.dot(&pose.translation()) }
 }
 
-/// Whether the object is seen from directions at least [`APART`] degrees apart.
-fn from_several_sides(used: &[(&PosedPhotograph, Mask)]) -> bool {
-    let Some(centre) = used.iter().find_map(|(p, mask)| centre_of(p, mask)) else { return true };
+/// Whether the object is seen from directions at least [`APART`] degrees apart; also if no depth says where it is.
+fn from_several_sides(used: &[(&PosedPhotograph, Mask)]) -> Result<bool, TeachError> {
+    let mut centre = None;
+    for (p, mask) in used {
+        centre = centre_of(p, mask)?;
+        if centre.is_some() {
+            break;
+        }
+    }
+    let Some(centre) = centre else { return Ok(true) };
     let towards: Vec<Vec3> = used
         .iter()
         .map(|(p, _)| (p.camera_from_world.inverse().translation() - centre).normalize())
         .collect();
-    let least = APART.to_radians().cos();
-    towards.iter().any(|a| towards.iter().any(|b| a.dot(b) <= least))
-}
-
-/// A mask without the pixels where something may occlude the object.
-fn not_hidden(photograph: &PosedPhotograph, mask: &Mask) -> Mask {
-    let Some(hidden) = &photograph.hidden else { return mask.clone() };
-    Image::from_fn(mask.width(), mask.height(), |x, y| {
-        mask[(x, y)] && !hidden.get(x, y).copied().unwrap_or(false)
-    })
+    let smallest = APART.to_radians().cos();
+    Ok(towards.iter().any(|a| towards.iter().any(|b| a.dot(b) <= smallest)))
 }
 
 /// The mean of the measured points in a mask.
-fn centre_of(photograph: &PosedPhotograph, mask: &Mask) -> Option<Vec3> {
+fn centre_of(photograph: &PosedPhotograph, mask: &Mask) -> Result<Option<Vec3>, TeachError> {
     let (depth, camera) = (straight_depth(photograph)?, photograph.camera.without_distortion());
     let (mut sum, mut count) = (Vec3::zeros(), 0.0);
     for (y, x) in (0..mask.height()).flat_map(|y| (0..mask.width()).map(move |x| (y, x))) {
@@ -226,19 +233,16 @@ fn centre_of(photograph: &PosedPhotograph, mask: &Mask) -> Option<Vec3> {
             count += 1.0;
         }
     }
-    (count > 0.0).then(|| photograph.camera_from_world.inverse().transform_point(&(sum / count)))
+    Ok((count > 0.0).then(|| photograph.camera_from_world.inverse().transform_point(&(sum / count))))
 }
 
-/// A photograph's depth in pixels without lens distortion.
-fn straight_depth(photograph: &PosedPhotograph) -> Option<DepthImage> {
-    Some(without_distortion(photograph.depth.as_ref()?, &photograph.camera))
-}
-
-fn without_distortion(depth: &DepthImage, camera: &Camera) -> DepthImage {
-    Image::from_fn(camera.width, camera.height, |x, y| {
-        let source = camera.distort_point(&Vec2::new(x as f64, y as f64));
-        nearest_pixel(&source, depth.width(), depth.height()).map_or(0.0, |pixel| depth[pixel])
-    })
+/// A photograph's depth in pixels without lens distortion; empty if it has none.
+fn straight_depth(photograph: &PosedPhotograph) -> Result<DepthImage, TeachError> {
+    let camera = &photograph.camera;
+    match &photograph.depth {
+        Some(depth) => Ok(undistort_depth(depth, camera).map_err(ViewError::Camera)?),
+        None => Ok(Image::filled(camera.width, camera.height, 0.0)),
+    }
 }
 
 /// The object in depth images from one side: in the given masks or, in a single image, the object on the table. `None` if there are
@@ -268,7 +272,7 @@ fn object_on_table(
     segmenter: &dyn Segmenter,
     options: &ShapeOptions,
 ) -> Result<Mask, TeachError> {
-    let depth = straight_depth(photograph).unwrap_or_else(|| Image::filled(1, 1, 0.0));
+    let depth = straight_depth(photograph)?;
     let found = find_objects(&depth, &photograph.camera.without_distortion(), &ViewOptions::default())?;
     let salient = salient_fraction(photograph, segmenter, options, &found).map_err(TeachError::Masks)?;
     let best = (0..found.len()).max_by(|a, b| salient[*a].total_cmp(&salient[*b]).then(b.cmp(a)));
@@ -291,7 +295,7 @@ fn object_on_table(
 /// The pose of a camera above the table that its depth image shows: the world's z is up, and the table is at zero. `None` if the image
 /// shows no table.
 pub(crate) fn camera_above_table(depth: &DepthImage, camera: &Camera) -> Option<Pose> {
-    let straight = without_distortion(depth, camera);
+    let straight = undistort_depth(depth, camera).ok()?;
     let table = find_table(&straight, &camera.without_distortion(), &ViewOptions::default())?;
     let up = table.normal;
     let ahead = Vec3::z() - up * up.z;

@@ -12,7 +12,7 @@ use sixfold_teach::{
     TeachError, TeachOptions, Teaching, World, export_bop, photographs_of, reconstruct, segment,
 };
 
-use support::{cuboid, png};
+use support::{cuboid, painted, png};
 
 mod support;
 
@@ -22,12 +22,7 @@ fn body() -> Mesh {
         cuboid([-0.045, -0.03, 0.0], [0.045, 0.03, 0.045]),
         cuboid([-0.01, -0.02, 0.045], [0.04, 0.02, 0.1]),
     ];
-    let colors = [[190, 60, 40], [40, 110, 170]];
-    let painted = parts
-        .iter()
-        .zip(colors)
-        .map(|(mesh, color)| mesh.clone().with_colors(vec![color; mesh.vertices().len()]).unwrap());
-    Mesh::merged(&painted.collect::<Vec<_>>()).unwrap()
+    painted(&parts, &[[190, 60, 40], [40, 110, 170]])
 }
 
 fn options() -> SimulationOptions {

@@ -12,7 +12,7 @@ use sixfold_teach::{
     reconstruct, segment,
 };
 
-use support::{cuboid, png};
+use support::{cuboid, painted, png};
 
 mod support;
 
@@ -20,12 +20,7 @@ mod support;
 fn carton() -> Mesh {
     let parts =
         [cuboid([-0.03, -0.05, 0.0], [0.03, 0.05, 0.12]), cuboid([-0.01, -0.07, 0.05], [0.01, -0.05, 0.07])];
-    let colors = [[200, 60, 40], [40, 110, 170]];
-    let painted = parts
-        .iter()
-        .zip(colors)
-        .map(|(mesh, color)| mesh.clone().with_colors(vec![color; mesh.vertices().len()]).unwrap());
-    Mesh::merged(&painted.collect::<Vec<_>>()).unwrap()
+    painted(&parts, &[[200, 60, 40], [40, 110, 170]])
 }
 
 fn options() -> SimulationOptions {
@@ -76,10 +71,6 @@ fn taught(
     Ok(teaching)
 }
 
-fn compose(a: &Pose, b: &Pose) -> Pose {
-    Pose::new(a.rotation() * b.rotation(), a.transform_point(&b.translation()))
-}
-
 #[test]
 fn the_hidden_side_of_a_carton_is_assumed_and_its_ledge_kept() {
     let (mesh, ground, options) = (carton(), Image::filled(64, 64, [90, 85, 70]), options());
@@ -96,7 +87,7 @@ fn the_hidden_side_of_a_carton_is_assumed_and_its_ledge_kept() {
     assert!(low.z.abs() < 0.004 && (high.z - 0.12).abs() < 0.006, "{low} {high}");
     // Against the truth, in the camera's frame.
     let found = in_world.transformed(&teaching.camera_from_board(0).unwrap());
-    let camera_from_true = compose(&capture.camera_from_board[0], &capture.board_from_object);
+    let camera_from_true = capture.camera_from_board[0] * capture.board_from_object;
     let there = mesh.transformed(&camera_from_true);
     let points = |mesh: &Mesh| mesh.sample_surface(20_000, 1).points;
     let mean = |from: &[Vec3], to: &[Vec3]| {

@@ -14,6 +14,15 @@ pub fn cuboid(low: [f64; 3], high: [f64; 3]) -> Mesh {
     Mesh::new((0..8).map(corner).collect(), faces).unwrap()
 }
 
+/// Parts in one colour each, as one mesh.
+pub fn painted(parts: &[Mesh], colors: &[[u8; 3]]) -> Mesh {
+    let painted = parts
+        .iter()
+        .zip(colors)
+        .map(|(mesh, color)| mesh.clone().with_colors(vec![*color; mesh.vertices().len()]).unwrap());
+    Mesh::merged(&painted.collect::<Vec<_>>()).unwrap()
+}
+
 /// The bytes of an image as a PNG file.
 pub fn png(image: &RgbImage) -> Vec<u8> {
     let (w, h) = image.size();
