@@ -33,7 +33,7 @@ fn squared_distance(mask: &Mask, of: bool) -> Image<f32> {
 }
 
 /// The lower envelope of the parabolas at all pixels of a line.
-fn along_line(values: &[f32]) -> Vec<f32> {
+pub(crate) fn along_line(values: &[f32]) -> Vec<f32> {
     let n = values.len();
     let (mut roots, mut bounds) = (vec![0usize; n], vec![0.0f32; n + 1]);
     let mut last = 0;

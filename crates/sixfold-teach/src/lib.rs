@@ -19,6 +19,7 @@ mod fusion;
 mod given;
 mod grid;
 mod ground;
+mod hollow;
 mod hull;
 mod located;
 mod one_side;

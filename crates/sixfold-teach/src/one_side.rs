@@ -159,16 +159,20 @@ impl<'a> OneSide<'a> {
     }
 
     /// The cleaned depth in the pixels of a view from the same place.
-    pub fn depth_in(&self, view: &View) -> DepthImage {
+    fn depth_in(&self, view: &View) -> DepthImage {
         Image::from_fn(view.camera.width, view.camera.height, |x, y| {
             let ray = view.camera.unproject(&Vec2::new(x as f64, y as f64), 1.0);
             self.surface_at(&ray).unwrap_or(0.0)
         })
     }
 
-    /// Whether a view is part of the photograph whose depth was cleaned.
-    pub fn is_of(&self, view: &View) -> bool {
-        view.camera_from_world == self.photograph.camera_from_world
+    /// Replaces the depth of views of the photograph whose depth was cleaned.
+    pub fn replace(&self, views: &[View], depths: &mut [DepthImage]) {
+        for (view, depth) in views.iter().zip(depths) {
+            if view.camera_from_world == self.photograph.camera_from_world {
+                *depth = self.depth_in(view);
+            }
+        }
     }
 }
 

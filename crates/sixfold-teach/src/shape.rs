@@ -10,6 +10,7 @@ use crate::error::TeachError;
 use crate::fusion::carved;
 use crate::given::{given_masks, searched_volume};
 use crate::grid::Grid;
+use crate::hollow::hollowed;
 use crate::hull::{Outlined, hull};
 use crate::one_side::{self, OneSide};
 use crate::paint::{centre, finer, painted};
@@ -43,6 +44,11 @@ const TABLE: f64 = 0.0005;
 
 /// Longer side of a view while the pose of a given mesh is found, pixels.
 const LAID_SIDE: usize = 220;
+
+/// Longer side of a view while hollows without texture are compared, pixels.
+const HOLLOW_SIDE: usize = 200;
+/// z of the up direction from which on an object counts as upright in the world.
+const UPRIGHT: f64 = 0.999;
 
 /// How far in front of and behind the hull depth is searched, metres.
 const BEYOND: f32 = 0.003;
@@ -416,6 +422,21 @@ fn in_view(view: &View, photograph: &PosedPhotograph, mask: &Mask) -> Mask {
     })
 }
 
+/// The views of the photographs that show a volume, with their masks.
+fn masked_views(
+    capture: &Capture,
+    found: &Segmentation,
+    volume: &Volume,
+    side: usize,
+    used: &[usize],
+) -> (Vec<View>, Vec<Mask>) {
+    let masked = |(i, view): (usize, View)| {
+        let mask = in_view(&view, &capture.photographs[i], found.masks[i].as_ref()?);
+        Some((view, mask))
+    };
+    views_of(capture, volume, side, used).into_iter().filter_map(masked).unzip()
+}
+
 /// Makes a mesh of the object from photographs and masks.
 ///
 /// # Errors
@@ -431,12 +452,7 @@ pub fn reconstruct(
     let one_side = OneSide::of(capture, &found.masks)?;
     let table = one_side.as_ref().and_then(|side| side.floor);
     let floor = capture.floor.or(table).map(above_table);
-    let numbered = views_of(capture, &found.volume, options.fine_side, &used);
-    let masks: Vec<Mask> = numbered
-        .iter()
-        .filter_map(|(i, view)| Some(in_view(view, &capture.photographs[*i], found.masks[*i].as_ref()?)))
-        .collect();
-    let views: Vec<View> = numbered.into_iter().map(|(_, view)| view).collect();
+    let (views, masks) = masked_views(capture, found, &found.volume, options.fine_side, &used);
     let outlined: Vec<Outlined<'_>> = views.iter().zip(&masks).map(|(v, m)| Outlined::new(v, m)).collect();
     let volume = match &one_side {
         Some(side) => side.volume,
@@ -453,17 +469,21 @@ pub fn reconstruct(
         Some(up) => standing(fine, &views, &masks, &up),
         None => fine,
     };
+    step(progress, 2, SHAPE_STEPS)?;
     let (fine, with_depth) = match depth_of(capture, &used, &found.volume, &fine, found, options) {
         Some(mut known) => {
-            step(progress, 2, SHAPE_STEPS)?;
             if let Some(side) = &one_side {
-                for (depth, view) in known.depths.iter_mut().zip(&known.views) {
-                    if side.is_of(view) {
-                        *depth = side.depth_in(view);
-                    }
-                }
+                side.replace(&known.views, &mut known.depths);
             }
-            (carved(&fine, &known.views, &known.depths, 3.0 * fine.step, known.minimum), known.fraction)
+            let emptied = carved(&fine, &known.views, &known.depths, 3.0 * fine.step, known.minimum);
+            let upright = floor.map(|f| f.normal).or(capture.up).is_some_and(|up| up.z > UPRIGHT);
+            let emptied = if !known.measured && upright {
+                let (views, masks) = masked_views(capture, found, &volume, HOLLOW_SIDE, &used);
+                hollowed(emptied, &fine, &views, &masks)
+            } else {
+                emptied
+            };
+            (emptied, known.fraction)
         }
         None => (fine, 0.0),
     };
@@ -514,12 +534,7 @@ pub(crate) fn lay(
     let used: Vec<usize> = (0..found.masks.len()).filter(|i| found.masks[*i].is_some()).collect();
     let (low, high) = hull_in_world.bounding_box();
     let volume = Volume { low, high }.scaled(1.2);
-    let numbered = views_of(capture, &volume, LAID_SIDE, &used);
-    let masks: Vec<Mask> = numbered
-        .iter()
-        .filter_map(|(i, view)| Some(in_view(view, &capture.photographs[*i], found.masks[*i].as_ref()?)))
-        .collect();
-    let views: Vec<View> = numbered.into_iter().map(|(_, view)| view).collect();
+    let (views, masks) = masked_views(capture, found, &volume, LAID_SIDE, &used);
     let part = Part { whole: progress, before: SHAPE_STEPS, total };
     let world_from_object = placed(given, &hull_in_world, &views, &masks, &part)?;
     let has_colors = given.colors().is_some() || given.texture().is_some();
@@ -535,6 +550,8 @@ pub(crate) fn lay(
 struct KnownDepth {
     views: Vec<View>,
     depths: Vec<DepthImage>,
+    /// Whether it was measured.
+    measured: bool,
     /// How many views have to agree that a place is empty.
     minimum: f32,
     /// Fraction of the masks' pixels that have depth.
@@ -554,12 +571,7 @@ fn depth_of(
         return None;
     }
     let side = if measured { options.fine_side } else { options.stereo_side };
-    let numbered = views_of(capture, volume, side, used);
-    let masks: Vec<Mask> = numbered
-        .iter()
-        .filter_map(|(i, view)| Some(in_view(view, &capture.photographs[*i], found.masks[*i].as_ref()?)))
-        .collect();
-    let views: Vec<View> = numbered.into_iter().map(|(_, view)| view).collect();
+    let (views, masks) = masked_views(capture, found, volume, side, used);
     let all: Vec<DepthImage> = if measured {
         views.iter().filter_map(|v| v.depth.clone()).collect()
     } else {
@@ -581,7 +593,7 @@ fn depth_of(
     let pixels = masks.iter().map(|m| m.as_slice().iter().filter(|v| **v).count()).sum::<usize>();
     let known = depths.iter().map(|d| d.as_slice().iter().filter(|v| **v > 0.0).count()).sum::<usize>();
     let minimum = if measured { 1.0 } else { 3.0 };
-    Some(KnownDepth { views, depths, minimum, fraction: known as f64 / pixels.max(1) as f64 })
+    Some(KnownDepth { views, depths, measured, minimum, fraction: known as f64 / pixels.max(1) as f64 })
 }
 
 /// The depths at which the rays of a view's pixels enter a closed mesh and first leave it again, with a margin.

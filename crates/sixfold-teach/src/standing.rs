@@ -29,7 +29,7 @@ pub(crate) fn standing(hull: Grid, views: &[View], masks: &[Mask], up: &Vec3) ->
 }
 
 /// The largest height of the plane that a mask allows; `None` if the mask shows nothing.
-fn allowed_by(hull: &Grid, view: &View, mask: &Mask, up: &Vec3) -> Option<f64> {
+pub(crate) fn allowed_by(hull: &Grid, view: &View, mask: &Mask, up: &Vec3) -> Option<f64> {
     let (width, height) = view.image.size();
     let mut highest = Image::filled(width, height, f64::NEG_INFINITY);
     for index in (0..hull.values.len()).filter(|i| hull.values[*i] < 0.0) {

@@ -47,12 +47,12 @@ pub(crate) fn depths(views: &[View], reaches: &[Reach], options: &StereoOptions)
     (0..views.len()).into_par_iter().map(|i| agreed(views, &swept, i, options)).collect()
 }
 
-fn luminance([r, g, b]: [u8; 3]) -> f32 {
+pub(crate) fn luminance([r, g, b]: [u8; 3]) -> f32 {
     0.299 * f32::from(r) + 0.587 * f32::from(g) + 0.114 * f32::from(b)
 }
 
 /// Views from directions 8 to 50 degrees away, nearest to 20 degrees first.
-fn neighbours_of(views: &[View], i: usize, most: usize) -> Vec<usize> {
+pub(crate) fn neighbours_of(views: &[View], i: usize, most: usize) -> Vec<usize> {
     let towards = |v: &View| v.camera_from_world.inverse().transform_direction(&sixfold_geometry::Vec3::z());
     let here = towards(&views[i]);
     let angle = |j: usize| here.dot(&towards(&views[j])).clamp(-1.0, 1.0).acos().to_degrees();
@@ -136,7 +136,12 @@ fn best_half(scores: impl Iterator<Item = f32>) -> f32 {
 
 /// The grey levels of another view at the points of this view's pixels with given depths; NaN for points outside its
 /// image.
-fn warped(views: &[View], greys: &[Image<f32>], (i, j): (usize, usize), depth: &DepthImage) -> Image<f32> {
+pub(crate) fn warped(
+    views: &[View],
+    greys: &[Image<f32>],
+    (i, j): (usize, usize),
+    depth: &DepthImage,
+) -> Image<f32> {
     let (here, there) = (&views[i], &views[j]);
     let relative = there.camera_from_world.to_matrix() * here.camera_from_world.inverse().to_matrix();
     let m: [[f32; 4]; 3] = std::array::from_fn(|r| std::array::from_fn(|c| relative[(r, c)] as f32));
