@@ -29,6 +29,8 @@ const DEPTHS: [f64; 8] = [0.0, 0.06, 0.12, 0.25, 0.4, 0.6, 0.8, 1.0];
 const CHANGES: [f64; 4] = [-0.1, -0.05, 0.05, 0.1];
 /// Radius of the narrowest part of a hollow, metres: anything narrower would be inside a handle.
 const NARROW: f64 = 0.008;
+/// How far below the rim the hull is continued upwards, metres.
+const BELOW_RIM: f64 = 0.006;
 /// By how much the photographs have to agree better on a hollow than on the shape without it.
 const BETTER: f64 = 0.02;
 /// Neighbours that a view is compared with.
@@ -53,39 +55,55 @@ struct Hollow {
     depth: f64,
 }
 
-/// The shape with the hollow that the photographs show; unchanged if they show none. The shape stands upright, with z up. `hull` is the
-/// shape before anything was carved.
-pub(crate) fn hollowed(shape: Grid, hull: &Grid, views: &[View], masks: &[Mask]) -> Grid {
-    let Some(standing) = Standing::of(hull, views, masks) else { return shape };
-    let deepest = Hollow { wall: WALLS[0], depth: standing.height };
-    let Some(compared) = Compared::new(views, masks, &shape, &standing.with(&shape, &deepest)) else {
-        return shape;
-    };
-    let filled = compared.agreement(&shape);
-    let mut best: Option<(f64, Grid, Hollow)> = None;
-    let mut compare = |hollow: Hollow| {
-        let grid = standing.with(&shape, &hollow);
-        let agreement = compared.agreement(&grid);
-        if agreement > best.as_ref().map_or(filled + BETTER, |b| b.0) {
-            best = Some((agreement, grid, hollow));
+/// The shape on which the photographs agree best: `carved`, which the comparison of windows carved from `hull`, or one of them with a
+/// hollow. The object stands upright, with z up.
+pub(crate) fn hollowed(carved: Grid, hull: Grid, views: &[View], masks: &[Mask]) -> Grid {
+    let Some(standing) = Standing::of(&hull, views, masks) else { return carved };
+    let deepest = standing.with(&carved, &Hollow { wall: WALLS[0], depth: standing.height });
+    let Some(compared) = Compared::new(views, masks, &hull, &deepest) else { return carved };
+    // Windows carve holes into thin walls, so the hollow is searched in the whole hull.
+    let found = searched(&standing, &hull, &compared);
+    let mut others = vec![];
+    if let Some(hollow) = found {
+        others.extend([&hull, &carved].map(|shape| standing.with(shape, &hollow)));
+    }
+    others.push(hull);
+    let mut most = compared.agreement(&carved) + BETTER;
+    let mut best = carved;
+    for other in others {
+        let agreement = compared.agreement(&other);
+        if agreement > most {
+            (most, best) = (agreement, other);
         }
-        best.as_ref().map(|b| b.2)
+    }
+    best
+}
+
+/// The hollow in a hull on which the photographs agree best; `None` if they agree better, or hardly less, on the whole hull.
+fn searched(standing: &Standing, hull: &Grid, compared: &Compared<'_>) -> Option<Hollow> {
+    let mut most = compared.agreement(hull) + BETTER;
+    let mut best = None;
+    let mut compare = |hollow: Hollow| {
+        let agreement = compared.agreement(&standing.with(hull, &hollow));
+        if agreement > most {
+            (most, best) = (agreement, Some(hollow));
+        }
+        best
     };
     let depth_of = |fraction: f64| fraction * standing.height;
     let mut found = None;
     for fraction in DEPTHS {
         found = compare(Hollow { wall: WALL, depth: depth_of(fraction) });
     }
-    if let Some(at) = found.filter(|h| h.depth > 0.0) {
-        for wall in WALLS {
-            found = compare(Hollow { wall, ..at });
-        }
-        let at = found.unwrap_or(at);
-        for change in CHANGES {
-            compare(Hollow { depth: at.depth + depth_of(change), ..at });
-        }
+    let Some(at) = found.filter(|h| h.depth > 0.0) else { return found };
+    for wall in WALLS {
+        found = compare(Hollow { wall, ..at });
     }
-    best.map_or(shape, |(_, grid, _)| grid)
+    let at = found.unwrap_or(at);
+    for change in CHANGES {
+        found = compare(Hollow { depth: at.depth + depth_of(change), ..at });
+    }
+    found
 }
 
 /// The hull of an object that stands upright, continued above its rim.
@@ -111,11 +129,13 @@ impl Standing {
         if !(rim.is_finite() && rim > low) {
             return None;
         }
-        let layer = (((rim - hull.low.z) / hull.step) as usize).min(d - 1);
-        let is_inside = |i: usize| {
-            hull.values[i] < 0.0 || (i / area > layer && hull.values[i % area + layer * area] < 0.0)
-        };
-        Some(Standing { inside: distances(hull, |i| !is_inside(i)), rim, height: rim - low })
+        // Above, the hull is a roof: the walls go on as columns. They begin below the rim, whose height is not exact.
+        let first = (((rim - BELOW_RIM - hull.low.z) / hull.step).max(0.0) as usize).min(d - 1);
+        let mut is_inside: Vec<bool> = hull.values.iter().map(|v| *v < 0.0).collect();
+        for i in (first + 1) * area..is_inside.len() {
+            is_inside[i] |= is_inside[i - area];
+        }
+        Some(Standing { inside: distances(hull, |i| !is_inside[i]), rim, height: rim - low })
     }
 
     /// A shape with a hollow, and nothing above its rim.
@@ -363,15 +383,17 @@ mod tests {
         (0..16).map(view).unzip()
     }
 
-    /// The hull of a mesh, and what is left of it.
-    fn both(mesh: &Mesh) -> [Grid; 2] {
+    /// The hull of a mesh, and what is left of it after something was carved from it.
+    fn both(mesh: &Mesh, carve: impl Fn(&mut Grid)) -> [Grid; 2] {
         let (views, masks) = views_of(mesh);
         let outlined: Vec<Outlined<'_>> =
             views.iter().zip(&masks).map(|(v, m)| Outlined::new(v, m)).collect();
         let volume = Volume { low: Vec3::new(-0.04, -0.04, -0.004), high: Vec3::new(0.04, 0.04, 0.1) };
         let floor = sixfold_geometry::Plane { normal: Vec3::z(), offset: 0.0 };
         let hull = hull(&outlined, &volume, 64, Some(floor));
-        let left = hollowed(hull.clone(), &hull, &views, &masks);
+        let mut carved = hull.clone();
+        carve(&mut carved);
+        let left = hollowed(carved, hull.clone(), &views, &masks);
         [hull, left]
     }
 
@@ -381,7 +403,7 @@ mod tests {
 
     #[test]
     fn a_cup_without_texture_is_emptied_and_keeps_its_walls() {
-        let [hull, cup] = both(&cup());
+        let [hull, cup] = both(&cup(), |_| ());
         assert!(is_inside(&hull, 0.0, 0.08), "the hull fills the cup beyond its rim");
         let floor = (0..70).find(|z| !is_inside(&cup, 0.0, 0.001 * f64::from(*z) + 0.001)).unwrap();
         assert!((4..13).contains(&floor), "the floor is at {floor} mm");
@@ -394,17 +416,32 @@ mod tests {
     }
 
     #[test]
+    fn a_hole_that_was_carved_into_a_wall_is_closed() {
+        // Everything within 15 mm of a point of the wall.
+        let wall = Vec3::new(0.033, 0.0, 0.04);
+        let carve = |grid: &mut Grid| {
+            for i in 0..grid.values.len() {
+                let inside = 0.015 - (grid.point(grid.place(i)) - wall).norm();
+                grid.values[i] = grid.values[i].max(inside as f32);
+            }
+        };
+        let [_, cup] = both(&cup(), carve);
+        assert!(is_inside(&cup, 0.0335, 0.04) && is_inside(&cup, 0.0335, 0.035));
+        assert!(!is_inside(&cup, 0.0, 0.04) && !is_inside(&cup, 0.025, 0.04));
+    }
+
+    #[test]
     fn a_solid_with_a_pattern_keeps_its_inside() {
         let color = |v: &Vec3| [(128.0 + 100.0 * (300.0 * v.x + 200.0 * v.y).sin()) as u8; 3];
         // Patterns are in the vertices, so the top needs some.
         let rings: Vec<(f64, f64)> = (0..20).map(|i| (0.035 - 0.035 / 19.0 * f64::from(i), 0.07)).collect();
         let mesh = lathed(&[vec![(0.0, 0.0), (0.035, 0.0)], rings].concat());
         let colors = mesh.vertices().iter().map(color).collect();
-        let [_, solid] = both(&mesh.with_colors(colors).unwrap());
+        let [_, solid] = both(&mesh.with_colors(colors).unwrap(), |_| ());
         for z in [0.01, 0.03, 0.06] {
             assert!(is_inside(&solid, 0.0, z) && is_inside(&solid, 0.025, z), "{z}");
         }
-        let [_, plain] = both(&cylinder());
+        let [_, plain] = both(&cylinder(), |_| ());
         assert!(is_inside(&plain, 0.0, 0.06) && is_inside(&plain, 0.025, 0.05));
     }
 

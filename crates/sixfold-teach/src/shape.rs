@@ -479,7 +479,7 @@ pub fn reconstruct(
             let upright = floor.map(|f| f.normal).or(capture.up).is_some_and(|up| up.z > UPRIGHT);
             let emptied = if !known.measured && upright {
                 let (views, masks) = masked_views(capture, found, &volume, HOLLOW_SIDE, &used);
-                hollowed(emptied, &fine, &views, &masks)
+                hollowed(emptied, fine, &views, &masks)
             } else {
                 emptied
             };
