@@ -9,17 +9,32 @@ use crate::view::View;
 
 /// Standard deviation of that smoothing, voxels.
 const SMOOTH: f64 = 1.2;
+/// Cosine of the angle between the outward direction and the direction to a camera below which the camera sees a wall from inside. Chosen
+/// by hand, not swept: views along a wall have to count, they made the hull.
+const INSIDE: f64 = -0.25;
 
-/// Carves from a hull the space that depth shows to be empty. A measurement counts up to `reach` metres behind the measured
-/// surface; at least `minimum` views have to agree.
-pub(crate) fn carved(hull: &Grid, views: &[View], depths: &[DepthImage], reach: f64, minimum: f32) -> Grid {
+/// What may be carved from a hull.
+pub(crate) struct Carving {
+    /// How far behind a measured surface a measurement counts, metres.
+    pub reach: f64,
+    /// Minimum number of views that have to agree.
+    pub minimum: f32,
+    /// Thickness of a wall, metres: what is nearer to the hull's surface is carved only by views from outside. Else noise in the depth of
+    /// a bowl's inside makes holes in the bowl.
+    pub wall: f64,
+}
+
+/// Carves from a hull the space that depth shows to be empty.
+pub(crate) fn carved(hull: &Grid, views: &[View], depths: &[DepthImage], carving: &Carving) -> Grid {
     let mut carved = hull.clone();
     carved.values.par_iter_mut().enumerate().for_each(|(index, value)| {
         // This point is far outside already.
-        if f64::from(*value) > reach {
+        if f64::from(*value) > carving.reach {
             return;
         }
-        if let Some(distance) = distance(&hull.point(hull.place(index)), views, depths, reach, minimum) {
+        let point = hull.point(hull.place(index));
+        let outwards = (f64::from(*value) > -carving.wall).then(|| hull.gradient(index));
+        if let Some(distance) = distance(&point, outwards, views, depths, carving) {
             *value = value.max(distance);
         }
     });
@@ -31,18 +46,59 @@ pub(crate) fn carved(hull: &Grid, views: &[View], depths: &[DepthImage], reach: 
     Grid { values, ..cut }
 }
 
-/// How far a point is in front of the measured surface, metres, limited to `reach` in both directions; `None` if too few
-/// views have a measurement.
-fn distance(point: &Vec3, views: &[View], depths: &[DepthImage], reach: f64, minimum: f32) -> Option<f32> {
+/// How far a point is in front of the measured surface, metres, limited to the reach in both directions; `None` if too few views have a
+/// measurement. With a direction outwards, views from inside do not count.
+fn distance(
+    point: &Vec3,
+    outwards: Option<Vec3>,
+    views: &[View],
+    depths: &[DepthImage],
+    Carving { reach, minimum, .. }: &Carving,
+) -> Option<f32> {
+    let outwards = outwards.and_then(|o| o.try_normalize(1e-9));
     let (mut sum, mut weight) = (0.0, 0.0);
     for (view, depth) in views.iter().zip(depths) {
-        let Some((pixel, z)) = view.project(point) else { continue };
-        let measured = f64::from(depth[(pixel.x.round() as usize, pixel.y.round() as usize)]);
-        if measured <= 0.0 || measured - z < -reach {
+        if outwards.is_some_and(|o| o.dot(&(view.eye - point).normalize()) < INSIDE) {
             continue;
         }
-        sum += (measured - z).min(reach) as f32;
+        let Some((pixel, z)) = view.project(point) else { continue };
+        let measured = f64::from(depth[(pixel.x.round() as usize, pixel.y.round() as usize)]);
+        if measured <= 0.0 || measured - z < -*reach {
+            continue;
+        }
+        sum += (measured - z).min(*reach) as f32;
         weight += 1.0;
     }
-    (weight >= minimum).then(|| sum / weight)
+    (weight >= *minimum).then(|| sum / weight)
+}
+
+#[cfg(test)]
+mod tests {
+    use sixfold_geometry::{Camera, Image, Pose};
+
+    use super::*;
+    use crate::view::Volume;
+
+    #[test]
+    fn the_far_side_of_a_wall_is_not_carved_by_wrong_depth_of_its_near_side() {
+        // A wall of 10 mm across z; the camera is half a metre before it and measures 8 mm behind it.
+        let volume = Volume { low: Vec3::repeat(-0.01), high: Vec3::repeat(0.01) };
+        let wall = Grid::new(&volume, 20, |p| (p.z.abs() - 0.005) as f32);
+        let camera =
+            Camera { fx: 500.0, fy: 500.0, cx: 39.5, cy: 39.5, width: 80, height: 80, distortion: None };
+        let pose = Pose::from_translation(Vec3::new(0.0, 0.0, 0.5));
+        let eye = pose.inverse().translation();
+        let image = Image::filled(80, 80, [0; 3]);
+        let view =
+            View { image, camera, camera_from_world: pose, eye, depth: None, mask: None, hidden: None };
+        let depth = Image::filled(80, 80, 0.513);
+        let inside = |thickness: f64, z: f64| {
+            let carving = Carving { reach: 0.02, minimum: 1.0, wall: thickness };
+            let left = carved(&wall, std::slice::from_ref(&view), std::slice::from_ref(&depth), &carving);
+            left.at(&Vec3::new(0.0, 0.0, z)).unwrap() < 0.0
+        };
+        assert!(!inside(0.0, 0.004) && !inside(0.0, -0.004), "without a thickness all is carved");
+        assert!(inside(0.004, 0.0035), "the far side stays");
+        assert!(!inside(0.004, -0.0035), "the near side is carved, the camera is outside");
+    }
 }

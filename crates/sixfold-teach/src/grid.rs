@@ -83,6 +83,17 @@ impl Grid {
         })
     }
 
+    /// The direction in which the values grow most at a voxel; its length is that of the differences.
+    pub fn gradient(&self, index: usize) -> Vec3 {
+        let (place, size) = (self.place(index), self.size);
+        let strides = [1, size[0], size[0] * size[1]];
+        Vec3::from_fn(|k, _| {
+            let down = if place[k] > 0 { index - strides[k] } else { index };
+            let up = if place[k] + 1 < size[k] { index + strides[k] } else { index };
+            f64::from(self.values[up] - self.values[down])
+        })
+    }
+
     /// The connected components (through faces) of values below zero, each as a list of voxels, largest first.
     pub fn components(&self) -> Vec<Vec<usize>> {
         let mut seen = vec![false; self.values.len()];

@@ -7,7 +7,7 @@ use sixfold_mesh::{Mesh, simplify};
 use sixfold_render::{Culling, RenderOptions, SceneObject, VisibilityBuffer};
 
 use crate::error::TeachError;
-use crate::fusion::carved;
+use crate::fusion::{Carving, carved};
 use crate::given::{given_masks, searched_volume};
 use crate::grid::Grid;
 use crate::hollow::hollowed;
@@ -45,6 +45,8 @@ const TABLE: f64 = 0.0005;
 /// Longer side of a view while the pose of a given mesh is found, pixels.
 const LAID_SIDE: usize = 220;
 
+/// Thickness of a wall into which stereo comparison makes no holes, voxels. Chosen by hand.
+const WALL: f64 = 3.0;
 /// Longer side of a view while hollows without texture are compared, pixels.
 const HOLLOW_SIDE: usize = 200;
 /// z of the up direction from which on an object counts as upright in the world.
@@ -475,7 +477,12 @@ pub fn reconstruct(
             if let Some(side) = &one_side {
                 side.replace(&known.views, &mut known.depths);
             }
-            let emptied = carved(&fine, &known.views, &known.depths, 3.0 * fine.step, known.minimum);
+            let carving = Carving {
+                reach: 3.0 * fine.step,
+                minimum: if known.measured { 1.0 } else { 3.0 },
+                wall: if known.measured { 0.0 } else { WALL * fine.step },
+            };
+            let emptied = carved(&fine, &known.views, &known.depths, &carving);
             let upright = floor.map(|f| f.normal).or(capture.up).is_some_and(|up| up.z > UPRIGHT);
             let emptied = if !known.measured && upright {
                 let (views, masks) = masked_views(capture, found, &volume, HOLLOW_SIDE, &used);
@@ -552,8 +559,6 @@ struct KnownDepth {
     depths: Vec<DepthImage>,
     /// Whether it was measured.
     measured: bool,
-    /// How many views have to agree that a place is empty.
-    minimum: f32,
     /// Fraction of the masks' pixels that have depth.
     fraction: f64,
 }
@@ -592,8 +597,7 @@ fn depth_of(
         .collect();
     let pixels = masks.iter().map(|m| m.as_slice().iter().filter(|v| **v).count()).sum::<usize>();
     let known = depths.iter().map(|d| d.as_slice().iter().filter(|v| **v > 0.0).count()).sum::<usize>();
-    let minimum = if measured { 1.0 } else { 3.0 };
-    Some(KnownDepth { views, depths, measured, minimum, fraction: known as f64 / pixels.max(1) as f64 })
+    Some(KnownDepth { views, depths, measured, fraction: known as f64 / pixels.max(1) as f64 })
 }
 
 /// The depths at which the rays of a view's pixels enter a closed mesh and first leave it again, with a margin.
