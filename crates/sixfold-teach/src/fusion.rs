@@ -33,7 +33,8 @@ pub(crate) fn carved(hull: &Grid, views: &[View], depths: &[DepthImage], carving
             return;
         }
         let point = hull.point(hull.place(index));
-        let outwards = (f64::from(*value) > -carving.wall).then(|| hull.gradient(index));
+        let outwards =
+            (carving.wall > 0.0 && f64::from(*value) > -carving.wall).then(|| hull.gradient(index));
         if let Some(distance) = distance(&point, outwards, views, depths, carving) {
             *value = value.max(distance);
         }
