@@ -1,39 +1,47 @@
-//! Distances to the border of a mask (Felzenszwalb and Huttenlocher 2012).
+//! Distances to the border of a mask, and to a set of voxels (Felzenszwalb and Huttenlocher 2012).
 
+use rayon::prelude::*;
 use sixfold_geometry::{Image, Mask};
 
 /// Signed distance of each pixel to the border of a mask, pixels: below zero inside, above zero outside.
 pub(crate) fn signed_distance(mask: &Mask) -> Image<f32> {
     let (width, height) = mask.size();
-    let outside = squared_distance(mask, true);
-    let inside = squared_distance(mask, false);
+    let to = |of: bool| squared_distances([width, height, 1], |i| mask.as_slice()[i] == of);
+    let (outside, inside) = (to(true), to(false));
     Image::from_fn(width, height, |x, y| {
+        let i = y * width + x;
         // The border is between two pixels, half a pixel from each.
-        if mask[(x, y)] { 0.5 - inside[(x, y)].sqrt() } else { outside[(x, y)].sqrt() - 0.5 }
+        if mask[(x, y)] { 0.5 - inside[i].sqrt() } else { outside[i].sqrt() - 0.5 }
     })
 }
 
-/// The squared distance to the nearest pixel of a value; the squared diagonal of the image if there is none.
-fn squared_distance(mask: &Mask, of: bool) -> Image<f32> {
-    let (width, height) = mask.size();
-    let far = (width * width + height * height) as f32;
-    let mut image = Image::from_fn(width, height, |x, y| if mask[(x, y)] == of { 0.0 } else { far });
-    let mut column = vec![0.0; height];
-    for x in 0..width {
-        (0..height).for_each(|y| column[y] = image[(x, y)]);
-        let done = along_line(&column);
-        (0..height).for_each(|y| image[(x, y)] = done[y]);
+/// The squared distance of each cell of a grid to the nearest cell of a set, in cells; x varies fastest. The squared diagonal of the grid
+/// if the set is empty; an axis of one cell has no length.
+pub(crate) fn squared_distances([w, h, d]: [usize; 3], of: impl Fn(usize) -> bool) -> Vec<f32> {
+    let area = w * h;
+    let far = [w, h, d].into_iter().filter(|n| *n > 1).map(|n| n * n).sum::<usize>() as f32;
+    let mut squares: Vec<f32> = (0..area * d).map(|i| if of(i) { 0.0 } else { far }).collect();
+    if area == 0 {
+        return squares;
     }
-    for y in 0..height {
-        let row = &mut image.as_mut_slice()[y * width..(y + 1) * width];
-        let done = along_line(row);
-        row.copy_from_slice(&done);
+    squares.par_chunks_mut(area).for_each(|layer| {
+        layer.chunks_mut(w).for_each(|row| row.copy_from_slice(&along_line(row)));
+        for x in 0..w {
+            let line: Vec<f32> = (0..h).map(|y| layer[x + w * y]).collect();
+            along_line(&line).into_iter().enumerate().for_each(|(y, value)| layer[x + w * y] = value);
+        }
+    });
+    if d > 1 {
+        let along_z = |c: usize| along_line(&(0..d).map(|z| squares[c + z * area]).collect::<Vec<f32>>());
+        let columns: Vec<Vec<f32>> = (0..area).into_par_iter().map(along_z).collect();
+        squares.iter_mut().enumerate().for_each(|(i, v)| *v = columns[i % area][i / area]);
     }
-    image.map(|v| v.min(far))
+    squares.iter_mut().for_each(|v| *v = v.min(far));
+    squares
 }
 
-/// The lower envelope of the parabolas at all pixels of a line.
-pub(crate) fn along_line(values: &[f32]) -> Vec<f32> {
+/// The lower envelope of the parabolas at all cells of a line.
+fn along_line(values: &[f32]) -> Vec<f32> {
     let n = values.len();
     let (mut roots, mut bounds) = (vec![0usize; n], vec![0.0f32; n + 1]);
     let mut last = 0;
@@ -92,5 +100,20 @@ mod tests {
         }
         let empty = signed_distance(&Image::filled(5, 4, false));
         assert!(empty.as_slice().iter().all(|d| *d > 5.0));
+    }
+
+    #[test]
+    fn distances_to_voxels_are_those_of_a_search_over_all() {
+        let size @ [w, h, _] = [7, 5, 6];
+        let place = |i: usize| [i % w, i / w % h, i / (w * h)];
+        let of = |i: usize| i % 37 == 5;
+        let found = squared_distances(size, of);
+        for (i, square) in found.iter().enumerate() {
+            let apart = |j: usize| {
+                let pairs = place(i).into_iter().zip(place(j));
+                pairs.map(|(a, b)| a.abs_diff(b).pow(2)).sum::<usize>()
+            };
+            assert_eq!(Some(*square as usize), (0..found.len()).filter(|j| of(*j)).map(apart).min(), "{i}");
+        }
     }
 }

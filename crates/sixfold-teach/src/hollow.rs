@@ -1,14 +1,18 @@
-//! Hollows without texture: cups, bowls, and flat tops.
+//! Hollows without texture: cups, bowls, and flat tops, by photo-consistency (Kutulakos and Seitz 2000) of whole shapes.
 //!
 //! The hull fills a cup up to its rim and beyond, and the comparison of small windows ([`crate::stereo`]) finds depth only where there
 //! is texture. Here a few whole shapes are compared instead: the hull with a hollow that is open from above, with walls of one thickness,
 //! down to one depth. The shape on which the photographs agree best is taken. A whole cup shows enough: the line between wall and
 //! floor, shadows, stains.
+//!
+//! Agreement is `sum(w c) / sum(w)` over the pixels that the shapes show differently: `c` is the mean correlation of the window around a
+//! pixel with the windows of the neighbours that see the same point, `cov(a, b) / sqrt((var a + n^2) (var b + n^2))` with noise `n`, and
+//! `w = var a / (var a + n^2)`.
 
 use rayon::prelude::*;
 use sixfold_geometry::{DepthImage, Image, Mask, Vec3};
 
-use crate::distance::along_line;
+use crate::distance::squared_distances;
 use crate::grid::Grid;
 use crate::silhouette::box_mean;
 use crate::standing::allowed_by;
@@ -61,53 +65,67 @@ pub(crate) fn hollowed(carved: Grid, hull: Grid, views: &[View], masks: &[Mask])
     let Some(standing) = Standing::of(&hull, views, masks) else { return carved };
     let deepest = standing.with(&carved, &Hollow { wall: WALLS[0], depth: standing.height });
     let Some(compared) = Compared::new(views, masks, &hull, &deepest) else { return carved };
-    // Windows carve holes into thin walls, so the hollow is searched in the whole hull.
-    let found = searched(&standing, &hull, &compared);
-    let mut others = vec![];
-    if let Some(hollow) = found {
-        others.extend([&hull, &carved].map(|shape| standing.with(shape, &hollow)));
-    }
-    others.push(hull);
+    let whole = compared.agreement(&hull);
     let mut most = compared.agreement(&carved) + BETTER;
-    let mut best = carved;
-    for other in others {
-        let agreement = compared.agreement(&other);
+    let mut best = carved.clone();
+    let mut compare = |agreement: f64, shape: Grid| {
         if agreement > most {
-            (most, best) = (agreement, other);
+            (most, best) = (agreement, shape);
         }
+    };
+    // Windows carve holes into thin walls, so the hollow is searched in the whole hull.
+    if let Some((agreement, hollow)) = searched(&standing, &hull, &compared, whole) {
+        compare(agreement, standing.with(&hull, &hollow));
+        let both = standing.with(&carved, &hollow);
+        compare(compared.agreement(&both), both);
     }
+    compare(whole, hull);
     best
 }
 
-/// The hollow in a hull on which the photographs agree best; `None` if they agree better, or hardly less, on the whole hull.
-fn searched(standing: &Standing, hull: &Grid, compared: &Compared<'_>) -> Option<Hollow> {
-    let mut most = compared.agreement(hull) + BETTER;
+/// The hollow in a hull on which the photographs agree best, and how well; `None` if they agree better, or hardly less, on the whole hull,
+/// which is given.
+fn searched(standing: &Standing, hull: &Grid, compared: &Compared<'_>, whole: f64) -> Option<(f64, Hollow)> {
+    let mut most = whole + BETTER;
     let mut best = None;
-    let mut compare = |hollow: Hollow| {
-        let agreement = compared.agreement(&standing.with(hull, &hollow));
+    let mut compare = |cavity: &Cavity, depth: f64| {
+        let agreement = compared.agreement(&standing.emptied(hull, cavity, depth));
         if agreement > most {
-            (most, best) = (agreement, Some(hollow));
+            most = agreement;
+            best = Some((agreement, Hollow { wall: cavity.wall, depth }));
         }
         best
     };
     let depth_of = |fraction: f64| fraction * standing.height;
+    let cavity = standing.cavity(WALL);
     let mut found = None;
     for fraction in DEPTHS {
-        found = compare(Hollow { wall: WALL, depth: depth_of(fraction) });
+        found = compare(&cavity, depth_of(fraction));
     }
-    let Some(at) = found.filter(|h| h.depth > 0.0) else { return found };
+    let Some((_, at)) = found.filter(|(_, h)| h.depth > 0.0) else { return found };
     for wall in WALLS {
-        found = compare(Hollow { wall, ..at });
+        found = compare(&standing.cavity(wall), at.depth);
     }
-    let at = found.unwrap_or(at);
+    let at = found.map_or(at, |(_, h)| h);
+    let cavity = standing.cavity(at.wall);
     for change in CHANGES {
-        found = compare(Hollow { depth: at.depth + depth_of(change), ..at });
+        found = compare(&cavity, at.depth + depth_of(change));
     }
     found
 }
 
+/// All that is more than a wall's thickness inside, open from above.
+struct Cavity {
+    wall: f64,
+    /// Distance of each voxel to its middle part, metres: it ends at [`NARROW`].
+    away: Vec<f32>,
+}
+
 /// The hull of an object that stands upright, continued above its rim.
 struct Standing {
+    /// Of the grid: voxels along each axis, and their distance, metres.
+    size: [usize; 3],
+    step: f64,
     /// Distance of each voxel to the outside, metres.
     inside: Vec<f32>,
     /// z of the rim.
@@ -135,45 +153,38 @@ impl Standing {
         for i in (first + 1) * area..is_inside.len() {
             is_inside[i] |= is_inside[i - area];
         }
-        Some(Standing { inside: distances(hull, |i| !is_inside[i]), rim, height: rim - low })
+        let inside = distances(hull.size, hull.step, |i| !is_inside[i]);
+        Some(Standing { size: hull.size, step: hull.step, inside, rim, height: rim - low })
+    }
+
+    fn cavity(&self, wall: f64) -> Cavity {
+        let inner = (wall + NARROW) as f32;
+        Cavity { wall, away: distances(self.size, self.step, |i| self.inside[i] > inner) }
     }
 
     /// A shape with a hollow, and nothing above its rim.
     fn with(&self, shape: &Grid, hollow: &Hollow) -> Grid {
+        self.emptied(shape, &self.cavity(hollow.wall), hollow.depth)
+    }
+
+    /// A shape without the part of a cavity down to a depth below the rim, and nothing above its rim.
+    fn emptied(&self, shape: &Grid, cavity: &Cavity, depth: f64) -> Grid {
         let area = shape.size[0] * shape.size[1];
-        let above_rim = |i: usize| (shape.low.z + (i / area) as f64 * shape.step - self.rim) as f32;
-        let mut with = shape.clone();
-        let cut = |values: &mut Vec<f32>, distance: &(dyn Fn(usize) -> f32 + Sync)| {
-            values.par_iter_mut().enumerate().for_each(|(i, v)| *v = v.max(distance(i)));
-        };
-        if hollow.depth > 0.0 {
-            let wall = (hollow.wall + NARROW) as f32;
-            let away = distances(shape, |i| self.inside[i] > wall);
-            let depth = hollow.depth as f32;
-            cut(&mut with.values, &|i| (NARROW as f32 - away[i]).min(above_rim(i) + depth));
-        }
-        cut(&mut with.values, &above_rim);
-        with
+        let mut emptied = shape.clone();
+        emptied.values.par_iter_mut().enumerate().for_each(|(i, v)| {
+            let above_rim = (shape.low.z + (i / area) as f64 * shape.step - self.rim) as f32;
+            if depth > 0.0 {
+                *v = v.max((NARROW as f32 - cavity.away[i]).min(above_rim + depth as f32));
+            }
+            *v = v.max(above_rim);
+        });
+        emptied
     }
 }
 
-/// The distance of each voxel to the nearest voxel of a set, metres; the size of the grid if the set is empty.
-fn distances(grid: &Grid, of: impl Fn(usize) -> bool + Sync) -> Vec<f32> {
-    let [w, h, d] = grid.size;
-    let area = w * h;
-    let far = ((w + h + d) as f32).powi(2);
-    let mut squares: Vec<f32> = (0..area * d).map(|i| if of(i) { 0.0 } else { far }).collect();
-    squares.par_chunks_mut(area).for_each(|layer| {
-        layer.chunks_mut(w).for_each(|row| row.copy_from_slice(&along_line(row)));
-        for x in 0..w {
-            let line: Vec<f32> = (0..h).map(|y| layer[x + w * y]).collect();
-            along_line(&line).into_iter().enumerate().for_each(|(y, value)| layer[x + w * y] = value);
-        }
-    });
-    let along_z = |c: usize| along_line(&(0..d).map(|z| squares[c + z * area]).collect::<Vec<f32>>());
-    let columns: Vec<Vec<f32>> = (0..area).into_par_iter().map(along_z).collect();
-    let step = grid.step as f32;
-    (0..area * d).map(|i| step * columns[i % area][i / area].min(far).sqrt()).collect()
+/// The distance of each voxel to the nearest voxel of a set, metres; the diagonal of the grid if the set is empty.
+fn distances(size: [usize; 3], step: f64, of: impl Fn(usize) -> bool) -> Vec<f32> {
+    squared_distances(size, of).into_iter().map(|square| step as f32 * square.sqrt()).collect()
 }
 
 /// The pixels in which shapes are compared.
@@ -443,18 +454,5 @@ mod tests {
         }
         let [_, plain] = both(&cylinder(), |_| ());
         assert!(is_inside(&plain, 0.0, 0.06) && is_inside(&plain, 0.025, 0.05));
-    }
-
-    #[test]
-    fn distances_are_those_of_a_search_over_all_voxels() {
-        let volume = Volume { low: Vec3::zeros(), high: Vec3::new(0.6, 0.4, 0.5) };
-        let grid = Grid::new(&volume, 6, |_| 0.0);
-        let of = |i: usize| i % 37 == 5;
-        let found = distances(&grid, of);
-        for (i, distance) in found.iter().enumerate() {
-            let here = grid.point(grid.place(i));
-            let all = (0..found.len()).filter(|j| of(*j)).map(|j| (grid.point(grid.place(j)) - here).norm());
-            assert!((f64::from(*distance) - all.fold(f64::INFINITY, f64::min)).abs() < 1e-5, "{i}");
-        }
     }
 }
