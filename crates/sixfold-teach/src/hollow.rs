@@ -362,7 +362,19 @@ mod tests {
 
     /// A cup of 70 mm with walls of 4 mm and a floor of 8 mm.
     fn cup() -> Mesh {
-        lathed(&[(0.0, 0.0), (0.035, 0.0), (0.035, 0.07), (0.031, 0.07), (0.031, 0.008), (0.0, 0.008)])
+        cup_with(0.004, 0.008)
+    }
+
+    fn cup_with(wall: f64, floor: f64) -> Mesh {
+        let inner = 0.035 - wall;
+        lathed(&[(0.0, 0.0), (0.035, 0.0), (0.035, 0.07), (inner, 0.07), (inner, floor), (0.0, floor)])
+    }
+
+    /// Height of the floor at the axis, and radius at which the wall begins at a height, millimetres.
+    fn floor_and_wall(cup: &Grid, z: f64) -> [usize; 2] {
+        let first = |is_inside: &dyn Fn(f64) -> bool| (0..70).find(|i| is_inside(0.001 * *i as f64)).unwrap();
+        let floor = first(&|height| !is_inside(cup, 0.0, height + 0.001));
+        [floor + 1, first(&|radius| is_inside(cup, radius, z))]
     }
 
     fn cylinder() -> Mesh {
@@ -416,14 +428,38 @@ mod tests {
     fn a_cup_without_texture_is_emptied_and_keeps_its_walls() {
         let [hull, cup] = both(&cup(), |_| ());
         assert!(is_inside(&hull, 0.0, 0.08), "the hull fills the cup beyond its rim");
-        let floor = (0..70).find(|z| !is_inside(&cup, 0.0, 0.001 * f64::from(*z) + 0.001)).unwrap();
-        assert!((4..13).contains(&floor), "the floor is at {floor} mm");
-        for z in [0.02, 0.04, 0.06] {
-            let wall = (0..35).find(|r| is_inside(&cup, 0.001 * f64::from(*r), z)).unwrap();
-            assert!((27..34).contains(&wall), "the wall begins at {wall} mm");
+        for z in [0.02, 0.04, 0.066] {
+            let [floor, wall] = floor_and_wall(&cup, z);
+            assert!((6..=11).contains(&floor), "the floor is at {floor} mm");
+            assert!((28..=33).contains(&wall), "the wall begins at {wall} mm at {z} m");
             assert!(is_inside(&cup, 0.0335, z));
         }
         assert!(!is_inside(&cup, 0.033, 0.074), "nothing is above the rim");
+    }
+
+    #[test]
+    fn walls_have_the_thickness_that_the_photographs_show() {
+        for (thickness, expected) in [(0.002, 30..=33), (0.0065, 26..=28)] {
+            let [_, cup] = both(&cup_with(thickness, 0.01), |_| ());
+            let [_, wall] = floor_and_wall(&cup, 0.04);
+            assert!(expected.contains(&wall), "the wall of {thickness} m begins at {wall} mm");
+        }
+    }
+
+    #[test]
+    fn a_cavity_does_not_reach_into_a_handle() {
+        // A solid cylinder of 60 mm with a fin 12 mm thick, which goes on above the rim.
+        let volume = Volume { low: Vec3::new(-0.05, -0.05, 0.0), high: Vec3::new(0.07, 0.05, 0.05) };
+        let grid = Grid::new(&volume, 60, |p| {
+            let body = p.x.hypot(p.y) - 0.03;
+            let fin = (p.y.abs() - 0.006).max(-p.x).max(p.x - 0.06);
+            body.min(fin) as f32
+        });
+        let inside = distances(grid.size, grid.step, |i| grid.values[i] >= 0.0);
+        let standing = Standing { size: grid.size, step: grid.step, inside, rim: 0.05, height: 0.05 };
+        let emptied = standing.emptied(&grid, &standing.cavity(0.003), 0.04);
+        assert!(is_inside(&grid, 0.045, 0.03) && is_inside(&emptied, 0.045, 0.03), "the fin is solid");
+        assert!(!is_inside(&emptied, 0.0, 0.03) && is_inside(&emptied, 0.0, 0.005));
     }
 
     #[test]
