@@ -39,6 +39,7 @@ mod stereo;
 mod surface;
 mod teaching;
 mod unboarded;
+mod unseen;
 mod upright;
 mod view;
 pub use cones::{Cone, volume_of_masks};

@@ -19,6 +19,7 @@ use crate::silhouette::{Cues, Segmenter, consensus, masks};
 use crate::standing::standing;
 use crate::stereo::{Reach, StereoOptions, depths};
 use crate::surface::surface;
+use crate::unseen::rounded;
 use crate::view::{PosedPhotograph, View, Volume};
 
 /// Minimum number of photographs for a shape.
@@ -480,7 +481,7 @@ pub fn reconstruct(
             let carving = Carving {
                 reach: 3.0 * fine.step,
                 minimum: if known.measured { 1.0 } else { 3.0 },
-                wall: if known.measured { 0.0 } else { WALL * fine.step },
+                wall: WALL * fine.step,
             };
             let emptied = carved(&fine, &known.views, &known.depths, &carving);
             let upright = floor.map(|f| f.normal).or(capture.up).is_some_and(|up| up.z > UPRIGHT);
@@ -496,7 +497,7 @@ pub fn reconstruct(
     };
     let fine = match &one_side {
         Some(side) => side.completed(&fine),
-        None => fine,
+        None => rounded(fine, &views, floor.map(|f| f.normal).or(capture.up)),
     };
     let mesh = surface(&fine.smoothed(0.8)).ok_or_else(no_object)?;
     step(progress, 3, SHAPE_STEPS)?;
