@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-use crate::numbers::{NAMES, Numbers, OF_COLOR, OF_DEPTH, OF_OTHERS};
+use crate::numbers::{NAMES, Numbers, OF_COLOR, OF_DEPTH, OF_OTHERS, OF_POSE};
 use crate::regression::{Fit, LogisticModel, fit};
 
 /// Version of the file format.
@@ -93,7 +93,7 @@ impl Calibration {
             |ranges: &[std::ops::Range<usize>]| -> Vec<usize> { ranges.iter().cloned().flatten().collect() };
         let takes = [
             takes(&[OF_DEPTH, OF_OTHERS]),
-            takes(&[OF_COLOR, OF_OTHERS]),
+            takes(&[OF_COLOR, OF_OTHERS, OF_POSE]),
             takes(&[OF_DEPTH, OF_COLOR, OF_OTHERS]),
         ];
         let model =
@@ -144,6 +144,30 @@ mod tests {
         assert!(broken("\"scaling\": [", "\"scaling\": [1,").contains("x.json"));
         let none = Calibration::read(Path::new("/nowhere/calibration.json")).unwrap_err().to_string();
         assert!(none.starts_with("/nowhere/calibration.json: "), "{none}");
+    }
+
+    #[test]
+    fn without_depth_a_small_object_far_away_is_less_probable() {
+        let shipped = Calibration::shipped().unwrap();
+        let place = |name: &str| NAMES.iter().position(|n| *n == name).unwrap();
+        let at = |diameters: f64| {
+            let mut numbers: Numbers = [None; NAMES.len()];
+            for (name, value) in
+                [("edges", 0.9), ("background_edges", 0.2), ("correlation", 0.6), ("tint", 0.03)]
+            {
+                numbers[place(name)] = Some(value);
+            }
+            (numbers[place("similarity")], numbers[place("distance")]) = (Some(0.9), Some(diameters.ln()));
+            (numbers[place("gap_here")], numbers[place("gap_elsewhere")]) = (Some(0.4), Some(0.4));
+            shipped.probability(&numbers)
+        };
+        assert!(
+            at(3.0) > 0.8 && at(12.0) < at(6.0) && at(6.0) < at(3.0) - 0.05,
+            "{} {} {}",
+            at(3.0),
+            at(6.0),
+            at(12.0)
+        );
     }
 
     #[test]

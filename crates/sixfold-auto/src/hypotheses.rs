@@ -82,10 +82,11 @@ impl Pool<'_> {
                 }
                 let similarity = estimate.details.get("similarity").and_then(serde_json::Value::as_f64);
                 let name = method.name();
+                let distance = centre(&estimate.camera_from_object, shape.mesh).z;
                 Some(Hypothesis {
                     method: name,
                     found_by: vec![name],
-                    numbers: of_evidence(&evidence, similarity),
+                    numbers: of_evidence(&evidence, similarity, distance / diameter),
                     strength: strength(&evidence, similarity),
                     estimate,
                     evidence,
@@ -171,10 +172,14 @@ const ALTERNATIVE: f64 = 0.25;
 /// An object whose centre is nearer than this many diameters is too close to the lens; chosen by hand, not swept.
 const AGAINST_LENS: f64 = 0.5;
 
-/// Tests the centre of the bounding box, because the object's frame may be anywhere.
-fn is_before_camera(pose: &Pose, mesh: &Mesh, diameter: f64) -> bool {
+/// The centre of the bounding box in the camera's frame; the object's frame may be anywhere.
+fn centre(pose: &Pose, mesh: &Mesh) -> Vec3 {
     let (low, high) = mesh.bounding_box();
-    let centre = pose.transform_point(&(0.5 * (low + high)));
+    pose.transform_point(&(0.5 * (low + high)))
+}
+
+fn is_before_camera(pose: &Pose, mesh: &Mesh, diameter: f64) -> bool {
+    let centre = centre(pose, mesh);
     centre.iter().all(|v| v.is_finite()) && centre.z > AGAINST_LENS * diameter
 }
 

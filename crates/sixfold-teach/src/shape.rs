@@ -481,7 +481,8 @@ pub fn reconstruct(
             let carving = Carving {
                 reach: 3.0 * fine.step,
                 minimum: if known.measured { 1.0 } else { 3.0 },
-                wall: WALL * fine.step,
+                // The far side of one view's hull is unknown.
+                wall: if one_side.is_some() { 0.0 } else { WALL * fine.step },
             };
             let emptied = carved(&fine, &known.views, &known.depths, &carving);
             let upright = floor.map(|f| f.normal).or(capture.up).is_some_and(|up| up.z > UPRIGHT);
