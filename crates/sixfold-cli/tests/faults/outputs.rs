@@ -41,6 +41,17 @@ pub fn leftovers(folder: &Path) -> Vec<PathBuf> {
     paths(folder).into_iter().filter(|p| is_temporary(p)).collect()
 }
 
+/// Gives a command on every store that has a write-ahead log. If two processes close a store at the same moment, SQLite deletes its log in
+/// neither, because that needs the file alone. What is in the log is stored, and the next command moves it into the store.
+pub fn take_over_logs(folder: &Path) {
+    for log in paths(folder).into_iter().filter(|p| p.extension().is_some_and(|end| end == "db-wal")) {
+        let store = log.with_extension("db");
+        let store = store.strip_prefix(folder).unwrap().display();
+        let list = sixfold(folder, &format!("grasp store list {store}"));
+        assert!(list.code < 2, "{}", list.stderr);
+    }
+}
+
 /// Name and length of all files below a folder, which change when something is written.
 pub fn fingerprint(folder: &Path) -> Vec<(PathBuf, u64)> {
     let length = |path: &Path| fs::metadata(path).map_or(0, |m| if m.is_file() { m.len() } else { 0 });

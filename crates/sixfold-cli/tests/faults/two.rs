@@ -4,7 +4,7 @@
 use std::time::Duration;
 
 use crate::driver::{Row, command, ended_well, prepared, reference, start, thorough};
-use crate::outputs::{differences, leftovers, tree};
+use crate::outputs::{differences, leftovers, take_over_logs, tree};
 
 /// Words of a refusal with a reason.
 const WHY: [&str; 3] = ["another process", "exists", "there is already"];
@@ -28,6 +28,7 @@ pub fn two_at_once(row: &Row) {
         if !runs.iter().any(|run| run.code == reference.code) {
             wrong.push("neither of both succeeded".to_owned());
         }
+        take_over_logs(folder.path());
         let left = leftovers(folder.path());
         if !left.is_empty() {
             wrong.push(format!("left behind: {left:?}"));
