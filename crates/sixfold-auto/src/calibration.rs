@@ -146,45 +146,40 @@ mod tests {
         assert!(none.starts_with("/nowhere/calibration.json: "), "{none}");
     }
 
+    /// The shipped probability of a pose of which these numbers are known.
+    fn probability(known: &[(&str, f64)]) -> f64 {
+        let mut numbers: Numbers = [None; NAMES.len()];
+        for (name, value) in known {
+            numbers[NAMES.iter().position(|n| n == name).unwrap()] = Some(*value);
+        }
+        Calibration::shipped().unwrap().probability(&numbers)
+    }
+
     #[test]
     fn without_depth_a_small_object_far_away_is_less_probable() {
-        let shipped = Calibration::shipped().unwrap();
-        let place = |name: &str| NAMES.iter().position(|n| *n == name).unwrap();
-        let at = |diameters: f64| {
-            let mut numbers: Numbers = [None; NAMES.len()];
-            for (name, value) in
-                [("edges", 0.9), ("background_edges", 0.2), ("correlation", 0.6), ("tint", 0.03)]
-            {
-                numbers[place(name)] = Some(value);
-            }
-            (numbers[place("similarity")], numbers[place("distance")]) = (Some(0.9), Some(diameters.ln()));
-            (numbers[place("gap_here")], numbers[place("gap_elsewhere")]) = (Some(0.4), Some(0.4));
-            shipped.probability(&numbers)
-        };
-        assert!(
-            at(3.0) > 0.8 && at(12.0) < at(6.0) && at(6.0) < at(3.0) - 0.05,
-            "{} {} {}",
-            at(3.0),
-            at(6.0),
-            at(12.0)
-        );
+        let image = [
+            ("edges", 0.9),
+            ("background_edges", 0.2),
+            ("correlation", 0.6),
+            ("tint", 0.03),
+            ("similarity", 0.9),
+        ];
+        let others = [("gap_here", 0.4), ("gap_elsewhere", 0.4)];
+        let at =
+            |diameters: f64| probability(&[&image[..], &others, &[("distance", diameters.ln())]].concat());
+        let [near, middle, far] = [3.0, 6.0, 12.0].map(at);
+        assert!(near > 0.8 && far < middle && middle < near - 0.05, "{near} {middle} {far}");
     }
 
     #[test]
     fn better_evidence_is_more_probable() {
-        let shipped = Calibration::shipped().unwrap();
-        let place = |name: &str| NAMES.iter().position(|n| *n == name).unwrap();
         let with = |score: f64| {
-            let mut numbers: Numbers = [None; NAMES.len()];
-            for name in ["depth", "boundary", "normals", "visible", "total"] {
-                numbers[place(name)] = Some(score);
-            }
-            (numbers[place("pixels")], numbers[place("relief")]) = (Some(8.0), Some(0.6));
-            (numbers[place("pierced")], numbers[place("on_plane")]) = (Some(0.0), Some(0.0));
-            (numbers[place("gap_here")], numbers[place("gap_elsewhere")]) = (Some(0.4), Some(score - 0.5));
-            shipped.probability(&numbers)
+            let scores = ["depth", "boundary", "normals", "visible", "total"].map(|name| (name, score));
+            let fixed =
+                [("pixels", 8.0), ("relief", 0.6), ("pierced", 0.0), ("on_plane", 0.0), ("gap_here", 0.4)];
+            probability(&[&scores[..], &fixed, &[("gap_elsewhere", score - 0.5)]].concat())
         };
         assert!(with(1.0) > 0.8 && with(0.3) < 0.2, "{} {}", with(1.0), with(0.3));
-        assert_eq!(shipped.probability(&[None; NAMES.len()]), 0.0);
+        assert_eq!(probability(&[]), 0.0);
     }
 }

@@ -6,13 +6,17 @@ use sixfold_geometry::{Image, Mask};
 /// Signed distance of each pixel to the border of a mask, pixels: below zero inside, above zero outside.
 pub(crate) fn signed_distance(mask: &Mask) -> Image<f32> {
     let (width, height) = mask.size();
-    let to = |of: bool| squared_distances([width, height, 1], |i| mask.as_slice()[i] == of);
+    let signed = signed_distances([width, height, 1], mask.as_slice());
+    Image::from_fn(width, height, |x, y| signed[y * width + x])
+}
+
+/// The same for the cells of a grid, in cells.
+pub(crate) fn signed_distances(size: [usize; 3], is_inside: &[bool]) -> Vec<f32> {
+    let to = |of: bool| squared_distances(size, |i| is_inside[i] == of);
     let (outside, inside) = (to(true), to(false));
-    Image::from_fn(width, height, |x, y| {
-        let i = y * width + x;
-        // The border is between two pixels, half a pixel from each.
-        if mask[(x, y)] { 0.5 - inside[i].sqrt() } else { outside[i].sqrt() - 0.5 }
-    })
+    // The border is between two cells, half a cell from each.
+    let signed = |i: usize| if is_inside[i] { 0.5 - inside[i].sqrt() } else { outside[i].sqrt() - 0.5 };
+    (0..is_inside.len()).map(signed).collect()
 }
 
 /// The squared distance of each cell of a grid to the nearest cell of a set, in cells; x varies fastest. The squared diagonal of the grid

@@ -448,7 +448,7 @@ mod tests {
 
     #[test]
     fn a_cavity_does_not_reach_into_a_handle() {
-        // A solid cylinder of 60 mm with a fin 12 mm thick, which goes on above the rim.
+        // A solid cylinder of 60 mm with a fin 12 mm thick, which continues above the rim.
         let volume = Volume { low: Vec3::new(-0.05, -0.05, 0.0), high: Vec3::new(0.07, 0.05, 0.05) };
         let grid = Grid::new(&volume, 60, |p| {
             let body = p.x.hypot(p.y) - 0.03;

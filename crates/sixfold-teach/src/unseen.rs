@@ -6,7 +6,7 @@ use rayon::prelude::*;
 use sixfold_geometry::Vec3;
 use sixfold_render::render_depth;
 
-use crate::distance::squared_distances;
+use crate::distance::signed_distances;
 use crate::grid::Grid;
 use crate::surface::surface;
 use crate::view::View;
@@ -32,21 +32,18 @@ pub(crate) fn rounded(shape: Grid, views: &[View], up: Option<Vec3>) -> Grid {
     let seen = seen(&shape, views);
     let filled: Vec<bool> = shape.values.iter().map(|v| *v < 0.0).collect();
     let mirror = up.map(|up| mirror(&shape, &filled, &up));
+    let grid = |values| Grid { low: shape.low, step: shape.step, size: shape.size, values };
     let mut inside = filled.clone();
     for _ in 0..ROUNDS {
         let source = |i: usize| mirror.as_ref().map_or(i, |mirror| mirror[i]);
         let values = (0..inside.len()).map(|i| f32::from(inside[source(i)])).collect();
-        let blurred = Grid { values, ..shape.clone() }.smoothed(DEVIATION);
+        let blurred = grid(values).smoothed(DEVIATION);
         for (i, inside) in inside.iter_mut().enumerate() {
             *inside = filled[i] && (seen[i] || blurred.values[i] > 0.5);
         }
     }
-    let to = |of: bool| squared_distances(shape.size, |i| inside[i] == of);
-    let (outside, within) = (to(true), to(false));
-    // The border is between two voxels, half a step from each.
-    let signed = |i: usize| if inside[i] { 0.5 - within[i].sqrt() } else { outside[i].sqrt() - 0.5 };
-    let values = (0..inside.len()).map(|i| shape.step as f32 * signed(i)).collect();
-    let left = Grid { values, ..shape.clone() }.smoothed(SMOOTH);
+    let signed = signed_distances(shape.size, &inside).into_iter();
+    let left = grid(signed.map(|distance| shape.step as f32 * distance).collect()).smoothed(SMOOTH);
     let values = shape.values.iter().zip(&left.values).zip(&seen);
     let values = values.map(|((before, left), seen)| if *seen { *before } else { before.max(*left) });
     Grid { values: values.collect(), ..left }
