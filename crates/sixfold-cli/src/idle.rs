@@ -13,6 +13,7 @@ pub(crate) const IDLE: &[Idle] = &[
     Idle { command: "estimate", options: &["object_id"], when: &[Is("method", &["auto", "pix2pose"]), Without("weights"), Without("detector")] },
     Idle { command: "estimate", options: &["detector"], when: &[IsNot("boxes", "detect")] },
     Idle { command: "estimate", options: &["weights"], when: &[Is("method", &["mttm"]), Is("matcher", &["points"])] },
+    Idle { command: "estimate", options: &["matcher"], when: &[Is("masks", &["network"]), Is("matcher", &["points", "both"])] },
     Idle { command: "estimate", options: &["cache"], when: &[With("no_cache")] },
     Idle { command: "detect", options: &["split"], when: &[Without("dataset")] },
     Idle { command: "eval", options: &["min_score"], when: &[Without("detections")] },

@@ -12,7 +12,7 @@ use sixfold_geometry::{Pose, Vec3};
 use crate::align::camera_from_view;
 use crate::error::StoreError;
 use crate::estimate::{
-    APART, KnownObject, MatchedBy, MttmOptions, Placed, SAME_ROTATION, Stages, apart, is_known, place_at,
+    APART, KnownObject, MatchedBy, MttmOptions, Placed, Stages, apart, is_known, place_at,
 };
 use crate::estimator::MttmEstimator;
 use crate::learned::Learned;
@@ -22,6 +22,7 @@ use crate::patch::Patch;
 use crate::published::{self, visible_centre};
 use crate::regions::RegionCache;
 use crate::roi::Roi;
+use crate::segmentation::nearest_entries;
 
 /// Regions compared with their templates as pairs: fewest and most. Chosen by hand; not swept.
 const COMPARED: (usize, usize) = (64, 400);
@@ -38,8 +39,6 @@ const LESS: usize = 30;
 /// Fraction (numerator, denominator) of the compared regions, the best matching ones, whose templates are aligned with the scene;
 /// chosen by hand, not swept.
 const ALIGNED: (usize, usize) = (3, 4);
-/// Nearest templates examined per hypothesis of a region: most of them are neighbours of one another. Chosen by hand; not swept.
-const NEAREST: usize = 60;
 impl KnownObject {
     /// The same object, with the network's descriptors of its templates.
     pub fn with_network(mut self, model: Arc<MttmModel>) -> KnownObject {
@@ -180,23 +179,9 @@ pub(crate) fn second_matching(
         .zip(&descriptors)
         .enumerate()
         .map(|(region, (roi, descriptor))| {
-            let camera_from_roi = roi.camera_from_roi();
-            let pose =
-                |e: &Entry| object.object_pose(&camera_from_view(&camera_from_roi, e.turn), e.template);
-            let mut chosen: Vec<(usize, Entry)> = vec![];
-            for (_, entry) in
-                learned.ranked(descriptor).into_iter().take(NEAREST * options.network_hypotheses)
-            {
-                if chosen.len() >= options.network_hypotheses {
-                    break;
-                }
-                let entry = object.matcher.entries()[entry];
-                let new = pose(&entry);
-                if !chosen.iter().any(|c| pose(&c.1).rotation_angle_to(&new) < SAME_ROTATION) {
-                    chosen.push((region, entry));
-                }
-            }
-            chosen
+            let most = options.network_hypotheses;
+            let entries = nearest_entries(object, learned, &roi.camera_from_roi(), descriptor, most);
+            entries.into_iter().map(|entry| (region, entry)).collect::<Vec<_>>()
         })
         .collect::<Vec<_>>()
         .concat();
@@ -224,7 +209,7 @@ pub(crate) fn second_matching(
     }
 }
 
-fn encode(scene: &DepthRegion, learned: &Learned, rois: &[Roi]) -> Encoded {
+pub(crate) fn encode(scene: &DepthRegion, learned: &Learned, rois: &[Roi]) -> Encoded {
     let (size, side) = (learned.size(), learned.model().side());
     let patches: Vec<Patch> =
         rois.iter().map(|roi| Patch::of_scene(scene, roi, size, side, |_| true)).collect();
@@ -232,7 +217,7 @@ fn encode(scene: &DepthRegion, learned: &Learned, rois: &[Roi]) -> Encoded {
 }
 
 /// The initial pose for aligning a template.
-fn start(
+pub(crate) fn start(
     scene: &DepthRegion,
     object: &KnownObject,
     learned: &Learned,

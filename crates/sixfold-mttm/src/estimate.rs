@@ -17,7 +17,7 @@ use crate::matching::{Match, MatchOptions, Matcher};
 use crate::roi::{ProposalOptions, Roi, propose};
 use crate::template::{ObjectTemplates, Source};
 use crate::views::ViewCoverage;
-use crate::{by_network, learned::Learned, published, regions::RegionCache};
+use crate::{by_network, learned::Learned, published, regions::RegionCache, segmentation};
 
 /// How regions are matched with templates.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -28,6 +28,16 @@ pub enum MatchedBy {
     Network,
     /// The network's descriptors choose the regions; points and network both match them with templates.
     Both,
+}
+
+/// Where the masks of estimates come from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum MaskSource {
+    /// From the matched template, aligned with the scene.
+    Aligned,
+    /// Predicted by the network before any alignment (dissertation, section 5.3.2). Regions and hypotheses are then those of the
+    /// network alone.
+    Network,
 }
 
 /// Options of the search for objects.
@@ -52,6 +62,8 @@ pub struct MttmOptions {
     pub network_hypotheses: usize,
     /// Hypotheses that are refined and verified with the mesh, if there is one.
     pub verified: usize,
+    /// Where masks come from; without a network always from aligned templates.
+    pub masks: MaskSource,
     /// Regions, masks and hypotheses as published, if there is a network; see [`MttmOptions::published`].
     pub published: bool,
     /// Align matched templates with the scene's surface; otherwise the pose is that of the nearest template, as matched.
@@ -116,6 +128,7 @@ impl Default for MttmOptions {
             hypotheses: HYPOTHESES,
             network_hypotheses: NETWORK_HYPOTHESES,
             verified: VERIFIED,
+            masks: MaskSource::Aligned,
             published: false,
             align: true,
             verification: VerificationOptions::default(),
@@ -252,8 +265,8 @@ pub struct MttmEstimate {
     pub score: VerificationScore,
     /// The matched template.
     pub template: usize,
-    /// Pixels of the object according to the matched template, before any refinement with a mesh; in the published form according
-    /// to the network, before any alignment.
+    /// Pixels of the object according to the matched template, before any refinement with a mesh; with [`MaskSource::Network`] and in
+    /// the published form according to the network, before any alignment.
     pub mask: Pixels,
 }
 
@@ -341,8 +354,15 @@ pub(crate) fn search(
         MatchedBy::Points => None,
         MatchedBy::Network | MatchedBy::Both => object.learned.as_ref(),
     };
-    if let (true, Some(learned)) = (options.published, network) {
-        let mut hypotheses = published::hypotheses(scene, object, learned, regions, options, &mut stages);
+    let of_network = match (options.published, options.masks) {
+        (true, _) => network.map(|n| published::hypotheses(scene, object, n, regions, options, &mut stages)),
+        (false, MaskSource::Network) => object
+            .learned
+            .as_ref()
+            .map(|n| segmentation::hypotheses(scene, object, n, regions, options, &mut stages)),
+        (false, MaskSource::Aligned) => None,
+    };
+    if let Some(mut hypotheses) = of_network {
         hypotheses.sort_by(|a, b| b.support.total_cmp(&a.support));
         stages.matching = lap();
         let estimates = verify_all(scene, object, &hypotheses, options);

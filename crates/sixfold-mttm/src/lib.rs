@@ -47,6 +47,8 @@ mod regions;
 pub mod roi;
 #[cfg(feature = "network")]
 mod samples;
+#[cfg(feature = "network")]
+mod segmentation;
 mod store;
 mod template;
 #[cfg(feature = "network")]
@@ -55,10 +57,12 @@ mod views;
 #[cfg(not(feature = "network"))]
 mod without_network;
 #[cfg(not(feature = "network"))]
-use without_network::{self as by_network, self as learned, self as published, self as regions};
+use without_network::{
+    self as by_network, self as learned, self as published, self as regions, self as segmentation,
+};
 
 pub use error::{StoreError, TemplateError};
-pub use estimate::{KnownObject, MatchedBy, MttmEstimate, MttmOptions, Search, Stages, estimate};
+pub use estimate::{KnownObject, MaskSource, MatchedBy, MttmEstimate, MttmOptions, Search, Stages, estimate};
 pub use estimator::{MttmEstimator, MttmObject, TEMPLATES_FILE};
 pub use from_depth::DepthView;
 #[cfg(feature = "network")]

@@ -13,7 +13,7 @@ use sixfold_align::DepthRegion;
 use sixfold_geometry::{Pose, Vec2, Vec3};
 
 use crate::align::align_shortly;
-use crate::estimate::{KnownObject, MttmOptions, Placed, SAME_ROTATION, Stages, place_at};
+use crate::estimate::{KnownObject, MttmOptions, Placed, Stages, place_at};
 use crate::learned::Learned;
 use crate::mask::{Pixels, common, template_mask};
 use crate::matching::Entry;
@@ -22,6 +22,7 @@ use crate::network::MAP;
 use crate::patch::Patch;
 use crate::regions::RegionCache;
 use crate::roi::{Roi, UNKNOWN, ray_rotation};
+use crate::segmentation::nearest_entries;
 
 /// Regions of the first matching whose masks are predicted: those with the nearest templates. Chosen by hand; not swept.
 const SELECTED: usize = 200;
@@ -30,15 +31,13 @@ const AT_A_TIME: usize = 32;
 /// A cell, or a pixel, belongs to the object if its probability is at least this.
 const INSIDE: f32 = 0.5;
 /// Masks whose intersection exceeds this fraction of the smaller one belong to one object (section 5.2.4).
-const MERGED: f64 = 0.5;
+pub(crate) const MERGED: f64 = 0.5;
 /// Regions are left out when their first hypothesis overlaps their mask by less (section 5.2.5).
 const MIN_OVERLAP: f64 = 0.3;
 /// Masks are compared on every n-th column and row; chosen by hand, not swept.
 const STRIDE: usize = 2;
 /// Fewest pixels of a mask on these columns and rows; chosen by hand, not swept.
-const MIN_MASK: usize = 20;
-/// Nearest templates examined per hypothesis of a region. Chosen by hand; not swept.
-const NEAREST: usize = 60;
+pub(crate) const MIN_MASK: usize = 20;
 
 /// The hypotheses of all regions, aligned with the scene; each has the mask of its region.
 pub(crate) fn hypotheses(
@@ -86,13 +85,17 @@ pub(crate) fn hypotheses(
 fn merged(masks: Vec<(Roi, Pixels)>, most: usize) -> Vec<(Roi, Pixels)> {
     let mut kept: Vec<(Roi, Pixels)> = vec![];
     for (roi, mask) in masks {
-        let overlaps =
-            |other: &Pixels| common(&mask, other) as f64 > MERGED * mask.len().min(other.len()) as f64;
-        if kept.len() < most && mask.len() >= MIN_MASK && !kept.iter().any(|(_, other)| overlaps(other)) {
+        let known = kept.iter().any(|(_, other)| overlaps(&mask, other, MERGED));
+        if kept.len() < most && mask.len() >= MIN_MASK && !known {
             kept.push((roi, mask));
         }
     }
     kept
+}
+
+/// Whether the intersection of two masks exceeds a fraction of the smaller one.
+pub(crate) fn overlaps(a: &Pixels, b: &Pixels, fraction: f64) -> bool {
+    common(a, b) as f64 > fraction * a.len().min(b.len()) as f64
 }
 
 /// The second matching of one region, and whether its first hypothesis covers its mask.
@@ -110,18 +113,7 @@ fn region(
     let bare = model.without_background(&encoded, cells_of(scene, roi, size, first_mask));
     let Some(descriptor) = model.describe(&bare).into_iter().next() else { return vec![] };
     let camera_from_roi = roi.camera_from_roi();
-    let rotated = |e: &Entry| crate::align::camera_from_view(&camera_from_roi, e.turn);
-    let pose = |e: &Entry| object.object_pose(&rotated(e), e.template);
-    let mut entries: Vec<Entry> = vec![];
-    for (_, number) in learned.ranked(&descriptor).into_iter().take(NEAREST * options.hypotheses) {
-        if entries.len() == options.hypotheses {
-            break;
-        }
-        let entry = object.matcher.entries()[number];
-        if !entries.iter().any(|e| pose(e).rotation_angle_to(&pose(&entry)) < SAME_ROTATION) {
-            entries.push(entry);
-        }
-    }
+    let entries = nearest_entries(object, learned, &camera_from_roi, &descriptor, options.hypotheses);
     if entries.is_empty() {
         return vec![];
     }
@@ -185,7 +177,7 @@ fn overlap(a: &Pixels, b: &Pixels) -> f64 {
 }
 
 /// The measured pixels whose cell of a predicted mask (14 x 14) belongs to the object, on every `stride`-th column and row.
-fn mask_pixels(scene: &DepthRegion, roi: &Roi, size: f64, mask: &[f32], stride: usize) -> Pixels {
+pub(crate) fn mask_pixels(scene: &DepthRegion, roi: &Roi, size: f64, mask: &[f32], stride: usize) -> Pixels {
     let camera = scene.camera();
     let rotation = ray_rotation(&roi.centre);
     let (right, down, axis) = (rotation * Vec3::x(), rotation * Vec3::y(), rotation * Vec3::z());
@@ -208,15 +200,30 @@ fn mask_pixels(scene: &DepthRegion, roi: &Roi, size: f64, mask: &[f32], stride: 
             // The intersection of the pixel's ray with the region's square.
             let ray = camera.unproject(&Vec2::new(x as f64, y as f64), 1.0);
             let p = ray * (distance / axis.dot(&ray)) - roi.centre;
-            let cell = |along: f64| ((along / size + 0.5) * MAP as f64).floor();
-            let (u, v) = (cell(right.dot(&p)), cell(down.dot(&p)));
-            let within = |k: f64| (0.0..MAP as f64).contains(&k);
-            if within(u) && within(v) && mask[v as usize * MAP + u as usize] >= INSIDE {
+            let place = [right.dot(&p), down.dot(&p)].map(|along| (along / size + 0.5) * MAP as f64);
+            if probability(mask, place).is_some_and(|p| p >= INSIDE) {
                 pixels.push((y * camera.width + x) as u32);
             }
         }
     }
     pixels
+}
+
+/// The probability at a place in cells, from the left and upper border of a mask, by bilinear interpolation between the centres of its
+/// 14 x 14 cells; `None` outside.
+fn probability(mask: &[f32], place: [f64; 2]) -> Option<f32> {
+    if !place.iter().all(|k| (0.0..MAP as f64).contains(k)) {
+        return None;
+    }
+    let [(x, u), (y, v)] = place.map(|k| {
+        let k = (k - 0.5).clamp(0.0, (MAP - 1) as f64);
+        let first = (k.floor() as usize).min(MAP - 2);
+        (first, (k - first as f64) as f32)
+    });
+    let at = |x: usize, y: usize| mask[y * MAP + x];
+    let upper = at(x, y) * (1.0 - u) + at(x + 1, y) * u;
+    let lower = at(x, y + 1) * (1.0 - u) + at(x + 1, y + 1) * u;
+    Some(upper * (1.0 - v) + lower * v)
 }
 
 /// Which cells of a region show pixels of a mask that has only every [`STRIDE`]-th column and row.

@@ -1,4 +1,4 @@
-//! Replaces `by_network`, `learned`, `published` and `regions` when the feature `network` is off: no object has network
+//! Replaces `by_network`, `learned`, `published`, `regions` and `segmentation` when the feature `network` is off: no object has network
 //! descriptors, so these functions are never called.
 
 use sixfold_align::DepthRegion;

@@ -15,8 +15,8 @@ use sixfold_mttm::network::MAP;
 use sixfold_mttm::patch::Patch;
 use sixfold_mttm::roi::{Roi, UNKNOWN};
 use sixfold_mttm::{
-    DepthView, KnownObject, MttmEstimate, MttmOptions, ObjectTemplates, Search, Template, TemplateError,
-    TemplateOptions, estimate,
+    DepthView, KnownObject, MaskSource, MttmEstimate, MttmOptions, ObjectTemplates, Search, Template,
+    TemplateError, TemplateOptions, estimate,
 };
 use sixfold_render::{DepthSensor, RenderOptions, SceneObject, VisibilityBuffer, simulate_depth};
 
@@ -234,6 +234,38 @@ fn as_published_masks_come_first_and_poses_from_them() {
     assert!(right >= 2, "{right} of 4");
 }
 
+/// With the network that ships, and another object beside it.
+#[test]
+fn the_network_alone_gives_masks_that_no_alignment_changes() {
+    let object = both_ways(known(true))[1].clone();
+    let options = MttmOptions { masks: MaskSource::Network, min_score: 0.0, ..MttmOptions::default() };
+    let alone = MttmOptions { align: false, ..options };
+    let post = cuboid([-0.03, -0.03, 0.0], [0.03, 0.03, 0.09]);
+    let (mut overlaps, mut right) = (vec![], 0);
+    for (i, (x, y, yaw)) in
+        [(0.0, 0.0, 0.3), (0.15, 0.1, 2.0), (-0.18, -0.08, -2.4), (0.05, -0.1, 1.2)].into_iter().enumerate()
+    {
+        let truth = on_table(x, y, yaw);
+        let (depth, visible) =
+            render_scene(&[(&part(), truth), (&post, on_table(-x + 0.02, 0.15, 0.4))], i as u64);
+        let scene = prepared(&depth);
+        // Without a mesh nothing but the network ranks them.
+        let (by_network, stages) = estimate(&scene, &object.clone().without_mesh(), &alone);
+        assert!(stages.regions > 0);
+        overlaps.push(iou(&by_network[0], &visible, &depth));
+        assert!((0.0..=1.0).contains(&by_network[0].confidence));
+        let (found, _) = estimate(&scene, &object, &options);
+        let (t, r) = off(&found[0], &truth);
+        right += usize::from(t < 6.0 && r < 5.0);
+        if let Some(same) = found.iter().find(|f| f.template == by_network[0].template) {
+            assert_eq!(same.mask, by_network[0].mask);
+        }
+    }
+    println!("{overlaps:.2?} {right}");
+    assert!(overlaps.iter().filter(|o| **o > 0.5).count() >= 3, "{overlaps:.2?}");
+    assert!(right >= 3, "{right} of 4");
+}
+
 #[test]
 fn a_template_that_reaches_into_the_table_is_no_match() {
     let block = cuboid([-0.05, -0.05, 0.0], [0.05, 0.05, 0.1]);
@@ -373,12 +405,14 @@ fn same_result_at_any_number_of_threads() {
     let (depth, _) = render_scene(&[(&part(), on_table(0.02, 0.03, 1.1))], 2);
     let scene = prepared(&depth);
     for object in both_ways(known(true)) {
-        let with = |threads: usize| {
+        let with = |threads: usize, masks| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-            pool.install(|| estimate(&scene, &object, &MttmOptions::default()).0)
+            let options = MttmOptions { masks, ..MttmOptions::default() };
+            pool.install(|| estimate(&scene, &object, &options).0)
         };
-        let alone = with(1);
-        assert_eq!(alone, with(3));
+        let alone = with(1, MaskSource::Aligned);
+        assert_eq!(alone, with(3, MaskSource::Aligned));
+        assert_eq!(with(1, MaskSource::Network), with(3, MaskSource::Network));
         // Nor does it matter what else is searched in the scene.
         let search = Search::new(&scene);
         let first = search.estimate(&object, &MttmOptions::default()).0;

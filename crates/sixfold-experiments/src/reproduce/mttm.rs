@@ -17,7 +17,7 @@ use sixfold_estimator::{Cache, Object, PoseEstimator, downcast};
 use sixfold_geometry::{Camera, DepthImage, Pose};
 use sixfold_mesh::{Mesh, ModelInfo};
 use sixfold_mttm::model::MttmModel;
-use sixfold_mttm::{KnownObject, MatchedBy, MttmEstimator, MttmObject, MttmOptions, Search};
+use sixfold_mttm::{KnownObject, MaskSource, MatchedBy, MttmEstimator, MttmObject, MttmOptions, Search};
 use sixfold_ppf::{ObjectModel, PpfEstimator, PpfObject, PpfOptions};
 use sixfold_render::render_depth;
 
@@ -55,6 +55,9 @@ pub(crate) struct ReproduceMttmArguments {
     /// Leave out point pair features, for comparison on the same images
     #[arg(long)]
     pub no_ppf: bool,
+    /// Measure these rows only, by their keys in the JSON, such as network-masks,both (default: all)
+    #[arg(long, value_name = "KEY", value_delimiter = ',', value_parser = ROWS)]
+    pub rows: Vec<String>,
 }
 
 /// Pixels whose depth is this close to the rendered ground truth belong to the object, metres (dissertation, section 5.3.2).
@@ -69,6 +72,7 @@ struct Way {
     align: bool,
     mesh: bool,
     occluders_have_edges: bool,
+    masks: MaskSource,
     published: bool,
 }
 
@@ -81,12 +85,13 @@ const fn way(key: &'static str, title: &'static str, by: MatchedBy) -> Way {
         align: true,
         mesh: true,
         occluders_have_edges: true,
+        masks: MaskSource::Aligned,
         published: false,
     }
 }
 
 /// Variants of template matching, the default first.
-const WAYS: [Way; 11] = [
+const WAYS: [Way; 13] = [
     way("both", "points and network, aligned, verified with the mesh (default)", MatchedBy::Both),
     Way {
         predicted_pose: false,
@@ -117,6 +122,24 @@ const WAYS: [Way; 11] = [
         ..way("network-nearest", "the network's nearest template as it was matched", MatchedBy::Network)
     },
     Way {
+        align: false,
+        mesh: false,
+        masks: MaskSource::Network,
+        ..way(
+            "network-masks",
+            "masks by the network alone, ranked by it, nothing aligned (comparable with table 5.1)",
+            MatchedBy::Network,
+        )
+    },
+    Way {
+        masks: MaskSource::Network,
+        ..way(
+            "network-masks-verified",
+            "the same masks, ranked by their aligned and verified poses",
+            MatchedBy::Network,
+        )
+    },
+    Way {
         occluders_have_edges: false,
         published: true,
         ..way(
@@ -136,6 +159,15 @@ const WAYS: [Way; 11] = [
         ..way("points-nearest", "the nearest template by points as it was matched", MatchedBy::Points)
     },
 ];
+/// Keys of [`WAYS`].
+const ROWS: [&str; WAYS.len()] = {
+    let (mut keys, mut k) = ([""; WAYS.len()], 0);
+    while k < keys.len() {
+        keys[k] = WAYS[k].key;
+        k += 1;
+    }
+    keys
+};
 /// The row of another method.
 const PPF: (&str, &str) = ("ppf", "point pair features");
 
@@ -192,6 +224,8 @@ struct Inputs {
     #[serde(default)]
     models: Option<String>,
     ppf: bool,
+    #[serde(default)]
+    rows: Vec<String>,
     /// Fingerprint of the network.
     network: String,
 }
@@ -219,6 +253,7 @@ pub(crate) fn run(a: &ReproduceMttmArguments, json: &JsonArguments) -> Result<Ou
         split: a.split.clone(),
         models: a.models.clone(),
         ppf: !a.no_ppf,
+        rows: a.rows.clone(),
         network: format!("{:016x}", model.fingerprint()),
     };
     same_inputs(&a.out, &inputs)?;
@@ -340,7 +375,9 @@ fn measure(
     let scene = DepthRegion::from_depth(depth, camera, None, &DepthOptions::default())?;
     let mut measured = Measured::new();
     // Each variant separately, so that times are not shared.
-    let searches: Vec<Search<'_>> = WAYS.iter().map(|_| Search::new(&scene)).collect();
+    let ways: Vec<&Way> =
+        WAYS.iter().filter(|w| a.rows.is_empty() || a.rows.iter().any(|key| key == w.key)).collect();
+    let searches: Vec<Search<'_>> = ways.iter().map(|_| Search::new(&scene)).collect();
     for id in ids {
         let (Some(k), Some(truths)) = (known.get(id), truths.get(id)) else { continue };
         let instances: Vec<Vec<bool>> =
@@ -349,16 +386,24 @@ fn measure(
         let error = |pose: &Pose| {
             truths.iter().map(|t| pose_error(&k.points, &k.info, t, pose)).fold(f64::INFINITY, f64::min)
         };
-        for (way, search) in WAYS.iter().zip(&searches) {
+        for (way, search) in ways.iter().zip(&searches) {
             let object = if way.mesh { &k.with_mesh } else { &k.alone };
             let (matched_by, predicted_pose, align) = (way.by, way.predicted_pose, way.align);
+            let masks = way.masks;
             let verification = VerificationOptions {
                 occluders_have_edges: way.occluders_have_edges,
                 ..VerificationOptions::default()
             };
             let form = if way.published { MttmOptions::published() } else { MttmOptions::default() };
-            let options =
-                MttmOptions { matched_by, predicted_pose, align, verification, min_score: 0.0, ..form };
+            let options = MttmOptions {
+                matched_by,
+                predicted_pose,
+                align,
+                masks,
+                verification,
+                min_score: 0.0,
+                ..form
+            };
             let (found, stages) = search.estimate(object, &options);
             let best = found.first();
             let iou = best.map(|e| instances.iter().map(|i| overlap(&e.mask, i)).fold(0.0, f64::max));

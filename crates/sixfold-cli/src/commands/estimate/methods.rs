@@ -7,7 +7,7 @@ use anyhow::Result;
 use clap::{ArgMatches, Args, Command, Id, ValueEnum};
 use sixfold_align::DepthOptions;
 use sixfold_estimator::PoseEstimator;
-use sixfold_mttm::{MatchedBy, MttmEstimator, MttmOptions};
+use sixfold_mttm::{MaskSource, MatchedBy, MttmEstimator, MttmOptions};
 use sixfold_ppf::PpfEstimator;
 
 use super::arguments::CommonArguments;
@@ -122,6 +122,10 @@ struct MttmArguments {
     /// How regions are matched with templates (with --preset published: network)
     #[arg(long, value_enum, default_value = networks::DEFAULT_MATCHER, conflicts_with = "preset")]
     matcher: Matcher,
+    /// Where masks come from; with network, regions and hypotheses are those of the network alone too (with --preset published:
+    /// network)
+    #[arg(long, value_enum, default_value = "aligned", conflicts_with = "preset")]
+    masks: Masks,
     /// Directions from which a mesh's templates are rendered; around is for objects in any orientation (default: as in `object
     /// add`, else above)
     #[arg(long, value_enum, value_name = "VIEWS")]
@@ -139,7 +143,11 @@ impl MethodArguments for MttmArguments {
         let options = if self.preset.published() {
             MttmOptions::published()
         } else {
-            MttmOptions { matched_by: self.matcher.matched_by(), ..MttmOptions::default() }
+            MttmOptions {
+                matched_by: self.matcher.matched_by(),
+                masks: self.masks.source(),
+                ..MttmOptions::default()
+            }
         };
         let estimator = MttmEstimator {
             depth: depth_options(self.keep_plane, common),
@@ -149,6 +157,24 @@ impl MethodArguments for MttmArguments {
             ..MttmEstimator::default()
         };
         Ok(Box::new(networks::with_network(estimator, self.weights.as_deref())?))
+    }
+}
+
+/// Where the masks of `--method mttm` come from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Masks {
+    /// The matched template, aligned with the scene
+    Aligned,
+    /// The network, before any alignment
+    Network,
+}
+
+impl Masks {
+    fn source(self) -> MaskSource {
+        match self {
+            Masks::Aligned => MaskSource::Aligned,
+            Masks::Network => MaskSource::Network,
+        }
     }
 }
 
