@@ -15,6 +15,7 @@ mod loss;
 pub mod model;
 mod networks;
 pub mod outcome;
+pub mod quality;
 pub mod recipe;
 mod samples;
 mod training;

@@ -135,13 +135,14 @@ impl DgcmModel {
         format!("{}-{hash:016x}", self.card.architecture)
     }
 
-    /// Encodes an object's normals.
+    /// Encodes an object's normals and its own VD-NOC.
     ///
     /// # Panics
     /// If the crop's side differs from the network's.
     pub fn encode(&self, crop: &Crop) -> InputCode {
         assert_eq!(crop.side, self.crop.side, "a crop of another size than the network's");
-        let encoded = self.network.geometry(self.tensor(crop.normal_planes(), 1));
+        let planes = [crop.normal_planes(), crop.vd_noc_planes()].concat();
+        let encoded = self.network.geometry(self.tensor(planes, 1));
         let feature = numbers(encoded.feature.clone());
         InputCode { encoded, feature }
     }
@@ -169,7 +170,8 @@ impl DgcmModel {
 
     fn tensor(&self, values: Vec<f32>, count: usize) -> Tensor<4> {
         let side = self.crop.side;
-        Tensor::from_data(TensorData::new(values, [count, 3, side, side]), &self.device)
+        let channels = values.len() / (count * side * side);
+        Tensor::from_data(TensorData::new(values, [count, channels, side, side]), &self.device)
     }
 }
 

@@ -6,15 +6,21 @@ use burn::tensor::Device;
 use sixfold_nn::choice::Choice;
 use sixfold_nn::fingerprint::Fingerprint;
 use sixfold_nn::options::OptionError;
-use sixfold_nn::recipe::{Prepared, Recipe, Session, TrainingEvent};
+use sixfold_nn::recipe::{Prepared, Recipe, Session, TrainingEvent, continued_from};
 use sixfold_nn::train_error::TrainError;
-use sixfold_nn::weights::ModelCard;
+use sixfold_nn::weights::{ModelCard, load_weights};
 
 use crate::model::DgcmModel;
 use crate::networks::{CompactConfig, Network, PaperConfig};
+use crate::quality::{Quality, quality};
 use crate::samples::{GraspPoolOptions, Pool};
 use crate::training::{DgcmTraining, DgcmTrainingOptions};
 use sixfold_experience::CropOptions;
+
+/// Views of other objects for the model's card: the training's number divided by the first, at least the second, at most the third.
+const TEST_VIEWS: (usize, usize, usize) = (4, 64, 1600);
+/// The same for pairs of these views.
+const TEST_PAIRS: (usize, usize, usize) = (12, 8, 600);
 
 /// Which network is trained.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -72,6 +78,8 @@ pub struct DgcmRecipe {
     pub network: DgcmKind,
     /// ImageNet weights of ResNet-50 in torchvision's layout for [`DgcmKind::Paper`]; random ones if `None`.
     pub encoder: Option<PathBuf>,
+    /// Weights of a trained network of this kind to start from; random ones if `None`.
+    pub init: Option<PathBuf>,
     /// Number of steps; `None`: the value of [`DgcmKind::options`], as for the next three fields.
     pub steps: Option<u64>,
     /// Positive pairs in a step; the dissertation's network uses the same number of negative ones.
@@ -93,6 +101,7 @@ impl Default for DgcmRecipe {
         DgcmRecipe {
             network: DgcmKind::Compact,
             encoder: None,
+            init: None,
             steps: None,
             pairs: None,
             learning_rate: None,
@@ -128,7 +137,7 @@ impl Recipe for DgcmRecipe {
     type Samples = Pool;
     type Training = DgcmTraining;
     type Context = GraspPoolOptions;
-    type Report = ();
+    type Report = Quality;
 
     fn steps(&self) -> u64 {
         self.options().common.steps
@@ -154,11 +163,12 @@ impl Recipe for DgcmRecipe {
     fn inputs(&self, (): &()) -> Result<Fingerprint, TrainError> {
         // Every field by name, so that the compiler reports a new one; fields left out are in the options or have no effect.
         #[rustfmt::skip]
-        let DgcmRecipe { network, encoder, views, steps: _, pairs: _, lambda: _, learning_rate: _, seed: _, command: _ } = self;
+        let DgcmRecipe { network, encoder, init, views, steps: _, pairs: _, lambda: _, learning_rate: _, seed: _, command: _ } = self;
         Fingerprint::of(&self.options())?
             .with("network", network.name())
             .with("views", *views)
-            .with_file("encoder", encoder.as_deref())
+            .with_file("encoder", encoder.as_deref())?
+            .with_file("init", init.as_deref())
     }
 
     fn prepare(
@@ -167,7 +177,7 @@ impl Recipe for DgcmRecipe {
         _: &mut Session<'_>,
     ) -> Result<Prepared<DgcmTraining, GraspPoolOptions>, TrainError> {
         let device = Device::flex().autodiff();
-        let network = match (self.network, &self.encoder) {
+        let mut network = match (self.network, &self.encoder) {
             (DgcmKind::Compact, _) => Network::Compact(CompactConfig.init(self.seed, &device)),
             (DgcmKind::Paper, None) => Network::Paper(PaperConfig.init(self.seed, &device)),
             (DgcmKind::Paper, Some(file)) => {
@@ -175,6 +185,10 @@ impl Recipe for DgcmRecipe {
                 Network::Paper(network.map_err(TrainError::about("encoder"))?)
             }
         };
+        if let Some(file) = &self.init {
+            let architecture = network.architecture();
+            (network, _) = load_weights(network, file, architecture).map_err(TrainError::about("init"))?;
+        }
         let options = self.options();
         let pool = GraspPoolOptions { views: self.views, seed: self.seed, ..self.network.pool() };
         let mut card = ModelCard::new("", "DGCM-Net, grasps from experience");
@@ -182,7 +196,9 @@ impl Recipe for DgcmRecipe {
             "{} simulated depth views of procedural families (can, mug, cup, bottle, bowl, box, clamp, drill) with random axis scales; no scanned object and no photograph",
             self.views
         );
-        card.extra = serde_json::json!({ "training": options, "pool": pool });
+        card.extra = serde_json::json!({
+            "training": options, "pool": pool, "continued_from": continued_from(self.init.as_deref())?
+        });
         Ok(Prepared { training: DgcmTraining::new(network, options, device), card, context: pool })
     }
 
@@ -195,13 +211,27 @@ impl Recipe for DgcmRecipe {
         Ok(Pool::new(pool, &session.progress(TrainingEvent::Preparing)))
     }
 
+    /// Measures the coordinates of objects that were not used in the training.
     fn finish(
         &self,
-        Prepared { training, card, context: pool }: Prepared<DgcmTraining, GraspPoolOptions>,
+        Prepared { training, mut card, context: pool }: Prepared<DgcmTraining, GraspPoolOptions>,
         session: &mut Session<'_>,
-    ) -> Result<Option<()>, TrainError> {
-        let model = DgcmModel::new(training.into_network(), pool.crop, card);
-        model.save(&session.model()).map_err(TrainError::method)?;
-        Ok(Some(()))
+    ) -> Result<Option<Quality>, TrainError> {
+        let network = training.into_network();
+        let path = session.model();
+        DgcmModel::new(network.clone(), pool.crop, card.clone()).save(&path).map_err(TrainError::method)?;
+        let test = GraspPoolOptions {
+            views: (self.views / TEST_VIEWS.0).clamp(TEST_VIEWS.1, TEST_VIEWS.2),
+            seed: self.seed ^ 0x7e57,
+            ..pool
+        };
+        let pairs = (self.views / TEST_PAIRS.0).clamp(TEST_PAIRS.1, TEST_PAIRS.2);
+        let Some(test) = Pool::new(&test, &session.progress(TrainingEvent::Measuring)) else {
+            return Ok(None);
+        };
+        let quality = quality(&network, &test, pairs);
+        card.extra["quality"] = serde_json::to_value(&quality).map_err(TrainError::method)?;
+        DgcmModel::new(network, pool.crop, card).save(&path).map_err(TrainError::method)?;
+        Ok(Some(quality))
     }
 }

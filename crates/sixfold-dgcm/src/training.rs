@@ -9,7 +9,7 @@ use sixfold_nn::train_error::TrainError;
 use sixfold_nn::training::{Batches, Losses, Plan, Training};
 
 use crate::loss::{MARGIN, coordinate_loss, cross_loss, metric_loss};
-use crate::networks::Network;
+use crate::networks::{Network, VIEW};
 use crate::samples::{GraspPoolOptions, Pair, PairOptions, Pool};
 use sixfold_synth::shapes::Family;
 
@@ -200,8 +200,8 @@ impl Training for DgcmTraining {
         let tensor = |values: Vec<f32>, count: usize, channels: usize| {
             Tensor::<4>::from_data(TensorData::new(values, [count, channels, side, side]), &self.device)
         };
-        let input = network.geometry(tensor(batch.input, all, 3));
-        let experience = network.geometry(tensor(batch.experience, all, 3));
+        let input = network.geometry(tensor(batch.input, all, VIEW));
+        let experience = network.geometry(tensor(batch.experience, all, VIEW));
         let (metric, near, far) = metric_loss(&input.feature, &experience.feature, pairs);
         let different: Vec<f32> = batch
             .families
@@ -310,7 +310,7 @@ mod tests {
             (outcome.unwrap(), records, training.into_network())
         };
         let numbers = |n: &Network| -> Vec<f32> {
-            let x = Tensor::<4>::ones([1, 3, 96, 96], &Device::flex()) * 0.5;
+            let x = Tensor::<4>::ones([1, VIEW, 96, 96], &Device::flex()) * 0.5;
             n.geometry(x).feature.into_data().try_to_vec().unwrap()
         };
         let folder = tempfile::tempdir().unwrap();

@@ -96,9 +96,7 @@ pub(crate) fn first_matching(
     let regions = cache.of(scene, learned);
     let rois = &regions.rois;
     stages.sampled = regions.sampled;
-    let nearest = learned.nearest(&regions.descriptors);
-    let mut order: Vec<usize> = (0..rois.len()).collect();
-    order.sort_by(|&a, &b| nearest[a].0.total_cmp(&nearest[b].0).then(a.cmp(&b)));
+    let (nearest, order) = learned.nearest_first(&regions.descriptors);
     let compared = (rois.len() / ONE_IN).saturating_sub(LESS).clamp(COMPARED.0, COMPARED.1);
     let chosen = apart(rois, order, APART * diameter, compared);
     let entries: Vec<Entry> = chosen.iter().map(|&i| object.matcher.entries()[nearest[i].1]).collect();

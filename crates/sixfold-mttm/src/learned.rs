@@ -104,6 +104,14 @@ impl Learned {
             .collect()
     }
 
+    /// [`Learned::nearest`], and the numbers of the descriptors, those with the nearest entry first.
+    pub(crate) fn nearest_first(&self, regions: &[Descriptor]) -> (Vec<(f32, usize)>, Vec<usize>) {
+        let nearest = self.nearest(regions);
+        let mut order: Vec<usize> = (0..regions.len()).collect();
+        order.sort_by(|&a, &b| nearest[a].0.total_cmp(&nearest[b].0).then(a.cmp(&b)));
+        (nearest, order)
+    }
+
     /// All entries, nearest first.
     pub fn ranked(&self, region: &Descriptor) -> Vec<(f32, usize)> {
         let mut all: Vec<(f32, usize)> =

@@ -50,9 +50,7 @@ pub(crate) fn hypotheses(
 ) -> Vec<Placed> {
     let regions = cache.of(scene, learned);
     stages.sampled = regions.sampled;
-    let nearest = learned.nearest(&regions.descriptors);
-    let mut order: Vec<usize> = (0..regions.rois.len()).collect();
-    order.sort_by(|&a, &b| nearest[a].0.total_cmp(&nearest[b].0).then(a.cmp(&b)));
+    let (nearest, mut order) = learned.nearest_first(&regions.descriptors);
     order.truncate(SELECTED);
     // The first mask prediction, and one region of all masks that overlap: the seed has the nearest template.
     let entries: Vec<Entry> = order.iter().map(|&i| object.matcher.entries()[nearest[i].1]).collect();

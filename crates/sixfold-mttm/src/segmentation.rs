@@ -133,9 +133,7 @@ fn first_matching(
 ) -> Vec<Candidate> {
     let regions = cache.of(scene, learned);
     stages.sampled = regions.sampled;
-    let nearest = learned.nearest(&regions.descriptors);
-    let mut order: Vec<usize> = (0..regions.rois.len()).collect();
-    order.sort_by(|&a, &b| nearest[a].0.total_cmp(&nearest[b].0).then(a.cmp(&b)));
+    let (nearest, order) = learned.nearest_first(&regions.descriptors);
     let chosen = apart(&regions.rois, order, APART * object.templates.diameter, COMPARED);
     let candidates = chosen.par_chunks(AT_A_TIME).map(|part| {
         let entries: Vec<Entry> = part.iter().map(|&i| object.matcher.entries()[nearest[i].1]).collect();

@@ -229,9 +229,9 @@ fn as_published_masks_come_first_and_poses_from_them() {
         }
     }
     println!("{overlaps:.2?} {right}");
-    // Measured: 0.15, 0.68, 0.76, 0.58, and two poses of four.
+    // Measured: 0.26, 0.72, 0.82, 0.87, and four poses of four.
     assert!(overlaps.iter().filter(|o| **o > 0.5).count() >= 3, "{overlaps:.2?}");
-    assert!(right >= 2, "{right} of 4");
+    assert!(right >= 3, "{right} of 4");
 }
 
 /// With the network that ships, and another object beside it.

@@ -385,6 +385,11 @@ fn options_that_would_be_ignored_are_refused() {
             "--weights",
             "with --matcher points",
         ),
+        (
+            "estimate --method mttm --masks network --matcher both ONE FOUND",
+            "--matcher",
+            "with --masks network with --matcher both",
+        ),
         ("estimate ONE FOUND --cache folder --no-cache", "--cache", "with --no-cache"),
         ("detect --weights w --rgb c.png --split train", "--split", "without --dataset"),
         ("eval --dataset lmo --results r.csv --min-score 0.5", "--min-score", "without --detections"),

@@ -39,6 +39,29 @@ fn finds_the_pose_by_templates_with_and_without_the_mesh() {
     assert_eq!(std::fs::read(&kept).unwrap(), before);
 }
 
+/// The mask is the network's, not that of the pose.
+#[test]
+fn masks_of_the_network_come_before_any_alignment() {
+    let case = OneImage::new();
+    let dir = case.path();
+    write_part_mask(&case);
+    let truth = read_mask(&dir.join("mask.png")).unwrap();
+    let overlap = |options: &str, out: &str| {
+        let command = format!("{DEPTH} --object part.ply --unit mm --json --out {out} {options}");
+        let run = sixfold(dir, &command).expect(0).json();
+        assert_near(&pose_of(&run["poses"][0]["camera_from_object"]), &case.truth);
+        let mask = read_mask(&dir.join(out).join("masks/1-part-1.png")).unwrap();
+        let pairs = mask.as_slice().iter().zip(truth.as_slice());
+        let count = |of: fn(bool, bool) -> bool| pairs.clone().filter(|(a, b)| of(**a, **b)).count();
+        (mask.clone(), count(|a, b| a && b) as f64 / count(|a, b| a || b) as f64)
+    };
+    let (aligned, _) = overlap("--masks aligned", "aligned");
+    for options in ["--masks network", "--masks network --matcher network"] {
+        let (mask, iou) = overlap(options, "network");
+        assert!(iou > 0.5 && mask != aligned, "{options}: {iou}");
+    }
+}
+
 #[test]
 fn an_object_is_stored_with_templates_and_found() {
     let case = OneImage::new();

@@ -95,6 +95,14 @@ fn trainings_without_data_know_their_options_before_they_make_anything() {
         }
         sixfold(dir, &format!("{train} --export")).expect(0);
     }
+    // Another training continues from the first one's weights, and says so in its card.
+    let more = "train dgcm --init dgcm/model.safetensors --steps 1 --views 64 --pairs 2 --out more --json";
+    let more = sixfold(dir, more).expect(0).json();
+    assert_eq!((&more["quality"]["pairs"], &more["views"]), (&8.into(), &64.into()));
+    assert!(more["quality"]["coordinates"].as_f64().is_some_and(|error| error > 0.0 && error < 2.0));
+    let card = std::fs::read_to_string(dir.join("more/model.md")).unwrap();
+    assert!(card.contains("continued_from") && card.contains("dgcm/model.safetensors"), "{card}");
+    fails(dir, "train dgcm --init none.safetensors --views 64 --out fresh", &["init", "none.safetensors"]);
 }
 
 #[test]

@@ -12,6 +12,7 @@ fn commands_that_need_networks_name_the_feature() {
         ("train pix2pose --object part.ply --unit mm --out out".to_owned(), ""),
         ("synthesize --dataset tiny --out out".to_owned(), ""),
         (mttm("--matcher both"), "--matcher both"),
+        (mttm("--masks network"), "--masks network"),
         (mttm("--weights model.safetensors"), "--weights"),
     ];
     for (command, option) in refused {

@@ -4,6 +4,11 @@
 //! initial weights (normals differ from photographs, and with a sixth of the computation of ResNet-50 it sees six times the
 //! samples). It has ReLU instead of LeakyReLU in convolutions, and bilinear upsampling with convolutions instead of deconvolutions;
 //! the last step, from a quarter of the resolution, is a pixel shuffle.
+//!
+//! It sees the view's own VD-NOC next to its normals. Between two views of one object the VD-NOC of a point are related by an affine
+//! transformation (a rotation between the views, and two scales along the axes), so the network predicts that transformation, and a
+//! difference from it for every pixel. It compares the maps of both views for it: features are trained to be alike for views whose
+//! geometry is similar, so they say little about the rotation between them.
 
 use burn::module::Module;
 use burn::nn::Linear;
@@ -16,7 +21,7 @@ use sixfold_nn::kernels::Activation;
 use sixfold_nn::layers::{Conv, ConvConfig};
 use sixfold_nn::ops::{pixel_shuffle, upsample};
 
-use super::{Encoded, FEATURE, half};
+use super::{Encoded, FEATURE, VIEW, half};
 
 /// Slope of LeakyReLU in the dense layers.
 const SLOPE: f64 = 0.1;
@@ -26,6 +31,9 @@ const GEOMETRY: [usize; 5] = [24, 48, 96, 160, 192];
 const CODE: [usize; 5] = [16, 32, 64, 128, 128];
 /// Channels of the decoder at 1/32 of the resolution, and after each doubling.
 const DECODER: [usize; 4] = [64, 128, 96, 64];
+
+/// Channels of the comparison of both views.
+const PAIR: usize = 128;
 
 /// Sizes of the compact network.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -45,14 +53,14 @@ impl CompactConfig {
         let same = |channels: [usize; 2], rng: &mut ChaCha8Rng| {
             ConvConfig::new(channels, 3, Activation::Relu).init(2.0, rng, device)
         };
-        let steps = |channels: [usize; 5]| {
-            let mut inputs = 3;
+        let steps = |mut inputs: usize, channels: [usize; 5]| {
             channels.map(|outputs| [std::mem::replace(&mut inputs, outputs), outputs])
         };
-        let geometry: Vec<Conv> = steps(GEOMETRY).into_iter().map(|c| down(c, rng)).collect();
+        let geometry: Vec<Conv> = steps(VIEW, GEOMETRY).into_iter().map(|c| down(c, rng)).collect();
         let refine: Vec<Conv> = GEOMETRY[1..4].iter().map(|&c| same([c, c], rng)).collect();
-        let code: Vec<Conv> = steps(CODE).into_iter().map(|c| down(c, rng)).collect();
+        let code: Vec<Conv> = steps(3, CODE).into_iter().map(|c| down(c, rng)).collect();
         let smallest = (Self::SIDE / 32).pow(2);
+        let pair = [[GEOMETRY[2] + CODE[2], PAIR], [PAIR, PAIR]];
         let decoder: Vec<Conv> = (0..3)
             .map(|k| {
                 let skips = (GEOMETRY[3 - k] + CODE[3 - k]) / 2;
@@ -66,9 +74,12 @@ impl CompactConfig {
             feature_out: dense([FEATURE, FEATURE], rng, device),
             code,
             code_out: dense([CODE[4] * smallest, FEATURE], rng, device),
-            start: dense([3 * FEATURE, DECODER[0] * smallest], rng, device),
+            start: dense([4 * FEATURE, DECODER[0] * smallest], rng, device),
             decoder,
             head: ConvConfig::new([DECODER[3], 48], 3, Activation::Linear).init(0.1, rng, device),
+            pair: pair.map(|c| down(c, rng)).to_vec(),
+            pair_out: dense([PAIR * smallest, FEATURE], rng, device),
+            affine: dense([FEATURE, 12], rng, device),
         }
     }
 }
@@ -86,6 +97,9 @@ pub struct Compact {
     start: Linear,
     decoder: Vec<Conv>,
     head: Conv,
+    pair: Vec<Conv>,
+    pair_out: Linear,
+    affine: Linear,
 }
 
 sixfold_nn::displayed_by_name!(Compact);
@@ -98,8 +112,8 @@ fn flat(x: Tensor<4>) -> Tensor<2> {
 
 impl Compact {
     /// See [`super::Network::geometry`].
-    pub fn geometry(&self, normals: Tensor<4>) -> Encoded {
-        let mut x = normals;
+    pub fn geometry(&self, views: Tensor<4>) -> Encoded {
+        let mut x = views.clone();
         let mut maps = vec![];
         for (k, conv) in self.geometry.iter().enumerate() {
             x = conv.forward(x);
@@ -109,23 +123,27 @@ impl Compact {
             maps.push(x.clone());
         }
         let feature = leaky_relu(self.feature.forward(flat(x)), SLOPE);
-        Encoded { feature: self.feature_out.forward(feature).tanh(), maps }
+        Encoded { input: views, feature: self.feature_out.forward(feature).tanh(), maps }
     }
 
     /// See [`super::Network::vd_noc`].
     pub fn vd_noc(&self, vd_noc: Tensor<4>) -> Encoded {
-        let mut x = vd_noc;
+        let mut x = vd_noc.clone();
         let mut maps = vec![];
         for conv in &self.code {
             x = conv.forward(x);
             maps.push(x.clone());
         }
-        Encoded { feature: self.code_out.forward(flat(x)).tanh(), maps }
+        Encoded { input: vd_noc, feature: self.code_out.forward(flat(x)).tanh(), maps }
     }
 
     /// See [`super::Network::decode`].
     pub fn decode(&self, input: &Encoded, experience: Tensor<2>, code: &Encoded) -> Tensor<4> {
-        let features = Tensor::cat(vec![input.feature.clone(), experience, code.feature.clone()], 1);
+        let pair = Tensor::cat(vec![input.maps[2].clone(), code.maps[2].clone()], 1);
+        let pair = self.pair.iter().fold(pair, |x, conv| conv.forward(x));
+        let pair = leaky_relu(self.pair_out.forward(flat(pair)), SLOPE);
+        let affine = self.affine.forward(pair.clone());
+        let features = Tensor::cat(vec![input.feature.clone(), experience, code.feature.clone(), pair], 1);
         let batch = features.dims()[0];
         let side = CompactConfig::SIDE / 32;
         let mut x = leaky_relu(self.start.forward(features), SLOPE).reshape([batch, DECODER[0], side, side]);
@@ -133,6 +151,39 @@ impl Compact {
             let skips = vec![upsample(x), half(&input.maps[3 - k]), half(&code.maps[3 - k])];
             x = conv.forward(Tensor::cat(skips, 1));
         }
-        pixel_shuffle(self.head.forward(x), 4)
+        let view = input.input.clone();
+        let own = view.clone().narrow(1, 3, 3);
+        let object = view.narrow(1, 0, 3).square().sum_dim(1).greater_elem(0.0).float();
+        (moved(own, affine) + pixel_shuffle(self.head.forward(x), 4)) * object
+    }
+}
+
+/// Coordinates (`batch x 3 x side x side`) after an affine transformation each, given by its difference from the identity: the rows of
+/// its matrix, each followed by the translation (`batch x 12`).
+fn moved(coordinates: Tensor<4>, affine: Tensor<2>) -> Tensor<4> {
+    let [batch, _, height, width] = coordinates.dims();
+    let affine = affine.reshape([batch, 3, 4]);
+    let (matrix, translation) = (affine.clone().narrow(2, 0, 3), affine.narrow(2, 3, 1));
+    let flat = coordinates.reshape([batch, 3, height * width]);
+    (flat.clone() + matrix.matmul(flat) + translation).reshape([batch, 3, height, width])
+}
+
+#[cfg(test)]
+mod tests {
+    use burn::tensor::TensorData;
+
+    use super::*;
+
+    #[test]
+    fn an_affine_transformation_moves_every_pixel() {
+        let device = Device::flex();
+        // Two pixels, (1, 2, 3) and (4, 5, 6).
+        let points = vec![1.0f32, 4.0, 2.0, 5.0, 3.0, 6.0];
+        let points = Tensor::<4>::from_data(TensorData::new(points, [1, 3, 1, 2]), &device);
+        // x + 2 y + 0.5, y, z - x.
+        let affine = vec![0.0f32, 2.0, 0.0, 0.5, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0];
+        let affine = Tensor::<2>::from_data(TensorData::new(affine, [1, 12]), &device);
+        let found: Vec<f32> = moved(points, affine).into_data().try_to_vec().unwrap();
+        assert_eq!(found, [5.5, 14.5, 2.0, 5.0, 2.0, 2.0]);
     }
 }

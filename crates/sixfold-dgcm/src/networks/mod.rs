@@ -14,9 +14,14 @@ pub(crate) use paper::PaperConfig;
 /// Length of features and codes.
 pub(crate) const FEATURE: usize = sixfold_experience::FEATURE;
 
+/// Planes of a view: three of normals, three of its own VD-NOC.
+pub(crate) const VIEW: usize = 6;
+
 /// An encoder's output for a batch.
 #[derive(Debug, Clone)]
 pub struct Encoded {
+    /// The encoder's input, `batch x channels x side x side`.
+    pub input: Tensor<4>,
     /// `batch x 256`, each value from -1 to 1.
     pub feature: Tensor<2>,
     /// Maps at 1/2, 1/4, ... of the resolution, `batch x channels x height x width`.
@@ -27,6 +32,7 @@ impl Encoded {
     /// A part of the batch.
     pub fn narrow(&self, start: usize, count: usize) -> Encoded {
         Encoded {
+            input: self.input.clone().narrow(0, start, count),
             feature: self.feature.clone().narrow(0, start, count),
             maps: self.maps.iter().map(|m| m.clone().narrow(0, start, count)).collect(),
         }
@@ -35,6 +41,7 @@ impl Encoded {
     /// A batch of one, repeated.
     pub fn repeat(&self, count: usize) -> Encoded {
         Encoded {
+            input: self.input.clone().repeat_dim(0, count),
             feature: self.feature.clone().repeat_dim(0, count),
             maps: self.maps.iter().map(|m| m.clone().repeat_dim(0, count)).collect(),
         }
@@ -86,11 +93,12 @@ impl Network {
         }
     }
 
-    /// Normals (`batch x 3 x side x side`) to features.
-    pub fn geometry(&self, normals: Tensor<4>) -> Encoded {
+    /// Views to features: normals and the view's own VD-NOC, `batch x 6 x side x side`. The dissertation's network sees the normals
+    /// alone.
+    pub fn geometry(&self, views: Tensor<4>) -> Encoded {
         match self {
-            Network::Compact(n) => n.geometry(normals),
-            Network::Paper(n) => n.geometry(normals),
+            Network::Compact(n) => n.geometry(views),
+            Network::Paper(n) => n.geometry(views.narrow(1, 0, 3)),
         }
     }
 
@@ -119,9 +127,9 @@ mod tests {
     fn shapes(network: &Network, batch: usize) {
         let device = Device::flex();
         let side = network.side();
-        let x = Tensor::<4>::ones([batch, 3, side, side], &device) * 0.3;
+        let x = Tensor::<4>::ones([batch, VIEW, side, side], &device) * 0.3;
         let f = network.geometry(x.clone());
-        let c = network.vd_noc(x);
+        let c = network.vd_noc(x.narrow(1, 0, 3));
         assert_eq!(f.feature.dims(), [batch, FEATURE]);
         assert_eq!(c.feature.dims(), [batch, FEATURE]);
         let out = network.decode(&f.narrow(0, 1).repeat(batch), f.feature.clone(), &c);

@@ -129,24 +129,24 @@ fn flat(x: Tensor<4>) -> Tensor<2> {
 impl Paper {
     /// See [`super::Network::geometry`].
     pub fn geometry(&self, normals: Tensor<4>) -> Encoded {
-        let maps = self.backbone.features(normals);
+        let maps = self.backbone.features(normals.clone());
         let mut x = maps[3].clone();
         for conv in &self.geometry {
             x = leaky_relu(conv.forward(x), SLOPE);
         }
         let feature = leaky_relu(self.feature.forward(flat(x)), SLOPE);
-        Encoded { feature: self.feature_out.forward(feature).tanh(), maps }
+        Encoded { input: normals, feature: self.feature_out.forward(feature).tanh(), maps }
     }
 
     /// See [`super::Network::vd_noc`].
     pub fn vd_noc(&self, vd_noc: Tensor<4>) -> Encoded {
-        let mut x = vd_noc;
+        let mut x = vd_noc.clone();
         let mut maps = vec![];
         for conv in &self.code {
             x = leaky_relu(conv.forward(x), SLOPE);
             maps.push(x.clone());
         }
-        Encoded { feature: self.code_out.forward(flat(x)).tanh(), maps }
+        Encoded { input: vd_noc, feature: self.code_out.forward(flat(x)).tanh(), maps }
     }
 
     /// See [`super::Network::decode`].

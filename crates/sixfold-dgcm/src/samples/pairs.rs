@@ -7,11 +7,14 @@
 use rand::{Rng, RngExt};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
+use sixfold_experience::Extent;
+use sixfold_geometry::Vec3;
 use sixfold_geometry::random::stream;
 use sixfold_nn::layers::normal;
 use sixfold_synth::shapes::Family;
 
-use super::pool::{Pool, View};
+use super::pool::{Pool, SeenPixel, View};
+use crate::networks::VIEW;
 
 /// How pairs are sampled and augmented.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -34,18 +37,18 @@ impl Default for PairOptions {
     }
 }
 
-/// Two views as the network's input: planes of `side * side` numbers, three each.
+/// Two views as the network's input: planes of `side * side` numbers.
 #[derive(Debug, Clone)]
 pub struct Pair {
     /// Whether the views show similar geometry.
     pub positive: bool,
     /// Families of the first and of the second view.
     pub families: (Family, Family),
-    /// Normals of the first view, the input.
+    /// Normals and VD-NOC of the first view, the input: six planes.
     pub input: Vec<f32>,
-    /// Normals of the second view, the experience.
+    /// Normals and VD-NOC of the second view, the experience: six planes.
     pub experience: Vec<f32>,
-    /// VD-NOC of the second view in its own frame.
+    /// VD-NOC of the second view alone.
     pub vd_noc: Vec<f32>,
     /// VD-NOC of the first view's pixels in the second view's frame; zeros for a negative pair.
     pub target: Vec<f32>,
@@ -63,33 +66,27 @@ impl Pool {
         let mut pair = Pair {
             positive,
             families: (first.family, second.family),
-            input: vec![0.0; 3 * pixels],
-            experience: vec![0.0; 3 * pixels],
+            input: vec![0.0; VIEW * pixels],
+            experience: vec![0.0; VIEW * pixels],
             vd_noc: vec![0.0; 3 * pixels],
             target: vec![0.0; 3 * pixels],
             mask: vec![0.0; pixels],
         };
-        let hidden = block(first, side, options, &mut random);
-        for p in first.pixels.iter().filter(|p| !hidden(usize::from(p.index))) {
+        let trim = self.options().crop.trim;
+        let first = Shown::of(first, block(first, side, options, &mut random), trim);
+        let counterpart = second;
+        let second = Shown::of(second, block(second, side, options, &mut random), trim);
+        first.draw(&mut pair.input, options.noise, &mut random);
+        second.draw(&mut pair.experience, options.noise, &mut random);
+        pair.vd_noc.copy_from_slice(&pair.experience[3 * pixels..]);
+        for p in &first.pixels {
             let i = usize::from(p.index);
-            let place = if positive { Some(second.counterpart(p)) } else { None };
-            for k in 0..3 {
-                pair.input[k * pixels + i] =
-                    f32::from(p.normal[k]) / 127.0 + options.noise * normal(&mut random);
-                if let Some(place) = place {
+            pair.mask[i] = 1.0;
+            if positive {
+                let place = second.normalise(&counterpart.counterpart(p));
+                for k in 0..3 {
                     pair.target[k * pixels + i] = place[k].clamp(-options.limit, options.limit) as f32;
                 }
-            }
-            pair.mask[i] = 1.0;
-        }
-        let hidden = block(second, side, options, &mut random);
-        for p in second.pixels.iter().filter(|p| !hidden(usize::from(p.index))) {
-            let i = usize::from(p.index);
-            for k in 0..3 {
-                pair.experience[k * pixels + i] =
-                    f32::from(p.normal[k]) / 127.0 + options.noise * normal(&mut random);
-                pair.vd_noc[k * pixels + i] =
-                    f32::from(p.vd_noc[k]) / 127.0 + options.noise * normal(&mut random);
             }
         }
         pair
@@ -124,6 +121,49 @@ impl Pool {
         let first = any(views.len());
         (&views[first], &views[if positive { first } else { any(views.len()) }])
     }
+}
+
+/// What is left of a view behind a block. Its VD-NOC are those of the visible part, as in a crop of a partly hidden object.
+struct Shown<'a> {
+    pixels: Vec<&'a SeenPixel>,
+    /// The extent of the visible part, in VD-NOC of the whole view, whose z axis points the other way.
+    extent: Extent,
+}
+
+impl<'a> Shown<'a> {
+    fn of(view: &'a View, hidden: impl Fn(usize) -> bool, trim: f64) -> Shown<'a> {
+        let pixels: Vec<&SeenPixel> = view.pixels.iter().filter(|p| !hidden(usize::from(p.index))).collect();
+        let points: Vec<Vec3> = pixels.iter().map(|p| flipped(&vd_noc(p))).collect();
+        let whole = Extent { centre: Vec3::zeros(), half: Vec3::repeat(1.0) };
+        Shown { pixels, extent: Extent::of(&points, trim).unwrap_or(whole) }
+    }
+
+    /// VD-NOC of the visible part from that of the whole view.
+    fn normalise(&self, of_whole: &Vec3) -> Vec3 {
+        self.extent.normalise(&flipped(of_whole))
+    }
+
+    /// Writes normals and VD-NOC with noise into six planes.
+    fn draw(&self, planes: &mut [f32], noise: f32, random: &mut ChaCha8Rng) {
+        let size = planes.len() / VIEW;
+        for p in &self.pixels {
+            let own = self.normalise(&vd_noc(p));
+            for k in 0..3 {
+                let i = k * size + usize::from(p.index);
+                planes[i] = f32::from(p.normal[k]) / 127.0 + noise * normal(random);
+                planes[i + 3 * size] = own[k].clamp(-1.0, 1.0) as f32 + noise * normal(random);
+            }
+        }
+    }
+}
+
+fn vd_noc(pixel: &SeenPixel) -> Vec3 {
+    Vec3::from_fn(|k, _| f64::from(pixel.vd_noc[k]) / 127.0)
+}
+
+/// [`Extent`] converts points of the camera's frame, whose z axis points away from it.
+fn flipped(p: &Vec3) -> Vec3 {
+    Vec3::new(p.x, p.y, -p.z)
 }
 
 /// Which pixels a block hides: it enters from one side of the object's bounding box and covers a fraction of it.

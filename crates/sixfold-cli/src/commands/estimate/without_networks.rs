@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Result, bail};
 use sixfold_estimator::Region;
 use sixfold_geometry::RgbImage;
-use sixfold_mttm::{MatchedBy, MttmEstimator};
+use sixfold_mttm::{MaskSource, MatchedBy, MttmEstimator};
 use sixfold_runner::RegionSource;
 use sixfold_shell::WITHOUT_NETWORKS;
 
@@ -27,6 +27,9 @@ pub(super) fn regions(_weights: &Path, _ids: BTreeSet<u32>) -> Result<RegionSour
 
 /// The same estimator, if it matches by points only.
 pub(super) fn with_network(estimator: MttmEstimator, weights: Option<&Path>) -> Result<MttmEstimator> {
+    if estimator.options.masks == MaskSource::Network {
+        bail!("--masks network: {WITHOUT_NETWORKS}");
+    }
     match (estimator.options.matched_by, weights) {
         (_, Some(_)) => bail!("--weights: {WITHOUT_NETWORKS}"),
         (MatchedBy::Network, None) => bail!("--matcher network: {WITHOUT_NETWORKS}"),

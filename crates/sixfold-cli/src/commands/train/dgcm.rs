@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use anyhow::Result;
 use clap::Args;
 use serde::Serialize;
+use sixfold_dgcm::quality::Quality;
 use sixfold_dgcm::recipe::{DgcmKind, DgcmRecipe};
 use sixfold_nn::choice::Choice;
 
@@ -42,6 +43,9 @@ pub(crate) struct TrainDgcmArguments {
     /// ImageNet weights of ResNet-50 in torchvision's layout (.pth), for --network paper
     #[arg(long, value_name = "FILE")]
     pub encoder: Option<PathBuf>,
+    /// Continue from the weights of such a training
+    #[arg(long, value_name = "FILE.safetensors")]
+    pub init: Option<PathBuf>,
     #[arg(long, value_name = "N", help = help("Training steps", |k| k.options().common.steps.to_string()))]
     pub steps: Option<u64>,
     #[arg(long, value_name = "N", help = pairs_help())]
@@ -73,6 +77,7 @@ impl TrainDgcmArguments {
         DgcmRecipe {
             network: self.network.unwrap_or(default.network),
             encoder: self.encoder.clone(),
+            init: self.init.clone(),
             steps: self.steps,
             pairs: self.pairs,
             learning_rate: self.learning_rate,
@@ -84,18 +89,19 @@ impl TrainDgcmArguments {
     }
 }
 
-/// The amount of training data.
+/// The amount of training data, and what the model is worth on other objects.
 #[derive(Serialize)]
-pub(super) struct Views {
+pub(super) struct OnViews {
     views: usize,
+    pub quality: Quality,
 }
 
 /// Trains, or resumes a training, and writes the model.
-pub(super) fn train_dgcm(a: &TrainDgcmArguments) -> Result<Summary<Views>> {
+pub(super) fn train_dgcm(a: &TrainDgcmArguments) -> Result<Summary<OnViews>> {
     let recipe = checked(a.recipe())?;
     let shown = Shown {
         preparing: "views",
-        measuring: "model measured",
+        measuring: "test views",
         message: |record| {
             format!(
                 "metric {:.2}, distance {:.2} of similar and {:.2} of different pairs, coordinates off by {:.3}, {:.0} pairs/s",
@@ -108,5 +114,5 @@ pub(super) fn train_dgcm(a: &TrainDgcmArguments) -> Result<Summary<Views>> {
         },
     };
     let trained = train_in(&recipe, (), &a.result.out, a.result.export, shown)?;
-    Ok(summary(trained, |()| Views { views: recipe.views }))
+    Ok(summary(trained, |quality| OnViews { views: recipe.views, quality }))
 }

@@ -143,7 +143,16 @@ pub(crate) fn run(a: &TrainArguments) -> Result<Outcome> {
             })
         }
         #[cfg(feature = "experience")]
-        TrainCommand::Dgcm(of) => show(&a.json, &of.result.out, &dgcm::train_dgcm(of)?, || ()),
+        TrainCommand::Dgcm(of) => {
+            let summary = dgcm::train_dgcm(of)?;
+            show(&a.json, &of.result.out, &summary, || {
+                let quality = &summary.more.quality;
+                println!("on {} pairs of views of objects it was not trained on:", quality.pairs);
+                for (name, score) in quality.scores() {
+                    println!("  {name}: {score:.3}");
+                }
+            })
+        }
     }
 }
 

@@ -10,6 +10,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Result, bail};
 use clap::Args;
 use serde::Serialize;
+use sixfold_dgcm::model::DgcmModel;
 use sixfold_experience::StorePlace;
 use sixfold_io::write_rgb;
 
@@ -21,10 +22,12 @@ use crate::grasp::ways::METHODS;
 use sixfold_shell::Outcome;
 use sixfold_shell::grasp::experience::{NetworkArguments, OutboxArguments, memory, model};
 use sixfold_shell::grasp::learn::{self, Curve, LearnArguments};
-use sixfold_shell::grasp::object_list::{ObjectsArguments, file_name, objects_with_parts};
-use sixfold_shell::grasp::trial::{PhysicsArguments, hardness};
+use sixfold_shell::grasp::object_list::{Named, ObjectsArguments, PartBox, file_name, objects_with_parts};
+use sixfold_shell::grasp::trial::{Hardness, PhysicsArguments, hardness};
 use sixfold_shell::output::{JsonArguments, report, write_atomically};
 
+/// Values of `--figure`: figure 6.7 in both forms, and by the network alone.
+const TRANSFER: [&str; 2] = ["6.7", "6.7-network"];
 /// Largest feature distance at which experience proposes a grasp (dissertation, section 6.3.2).
 const NEAR: f64 = 0.9;
 /// Runs of learning from an empty store, each with its own seed.
@@ -47,6 +50,9 @@ pub(crate) struct ReproduceDgcmArguments {
     /// Few scenes and views, for a quick check
     #[arg(long)]
     pub quick: bool,
+    /// Measure only this figure of the dissertation, the errors of transferred grasps: in both forms, or by the network alone
+    #[arg(long, value_name = "FIGURE", value_parser = TRANSFER)]
+    pub figure: Option<String>,
     #[command(flatten)]
     pub network: NetworkArguments,
     /// Folder for table.md, reproduce.json, images and intermediate results
@@ -61,11 +67,20 @@ pub(crate) struct ReproduceDgcmArguments {
 struct Whole {
     quick: bool,
     compare: compare::Whole,
-    curves: Vec<Point>,
-    pairs: Vec<Pair>,
-    stretched: Vec<Stretched>,
+    #[serde(flatten)]
+    transfer: Transfer,
     incremental: Vec<FromNothing>,
     handles: Vec<handles::Row>,
+}
+
+/// Figure 6.7.
+#[derive(Serialize)]
+struct Transfer {
+    curves: Vec<Point>,
+    /// The same by the network alone, in the published form.
+    curves_alone: Vec<Point>,
+    pairs: Vec<Pair>,
+    stretched: Vec<Stretched>,
 }
 
 /// One object learned from an empty store, in several runs.
@@ -120,7 +135,75 @@ fn within<'a>(answers: impl IntoIterator<Item = &'a Answer>) -> (usize, [f64; 2]
     (count, near.map(|n| n as f64 / count.max(1) as f64))
 }
 
+/// What the parts without a store share.
+struct Context {
+    setting: Hardness,
+    network: DgcmModel,
+    objects: Named,
+    parts: Vec<Option<PartBox>>,
+    instances: Vec<Instance>,
+}
+
+impl Context {
+    fn of(a: &ReproduceDgcmArguments) -> Result<Context> {
+        let setting = hardness(&physics(), true)?;
+        let network = model(&a.network)?;
+        let (objects, parts) = objects_with_parts(&a.objects())?;
+        let instances = offline::instances(&objects, &setting.gripper);
+        if instances.is_empty() {
+            bail!("{}: no object that {} could hold from above", a.list.display(), setting.gripper.name);
+        }
+        Ok(Context { setting, network, objects, parts, instances })
+    }
+
+    /// Figure 6.7 in both forms.
+    fn transfer(&self, a: &ReproduceDgcmArguments) -> Result<Transfer> {
+        let only_alone = a.figure.as_deref() == Some(TRANSFER[1]);
+        let size = if a.quick {
+            Size { views: 1, rounds: 1, stretched: 2 }
+        } else {
+            Size { views: 6, rounds: 5, stretched: 24 }
+        };
+        // Views as from a camera; the hand's error is not simulated here.
+        let answers = |alone, folder| {
+            Offline {
+                instances: &self.instances,
+                network: &self.network,
+                gripper: &self.setting.gripper,
+                options: &self.setting.options,
+                size,
+                alone,
+                seed: a.seed,
+            }
+            .run(&a.out.join(folder))
+        };
+        let ours = if only_alone { vec![] } else { answers(false, "offline")? };
+        let alone = answers(true, "offline-alone")?;
+        // Pairs and stretched copies: by the network alone only where nothing else was measured.
+        let shown = if only_alone { &alone } else { &ours };
+        Ok(Transfer {
+            curves: points(&ours),
+            curves_alone: points(&alone),
+            pairs: pairs(&self.instances, shown),
+            stretched: stretched(shown),
+        })
+    }
+}
+
 pub(crate) fn run(a: &ReproduceDgcmArguments, json: &JsonArguments) -> Result<Outcome> {
+    if a.figure.is_some() {
+        let context = Context::of(a)?;
+        let transfer = context.transfer(a)?;
+        let mut text = String::new();
+        transfer.add_markdown(&mut text);
+        transfer.draw(&a.out, &context.instances)?;
+        write_atomically(&a.out.join("transfer.json"), serde_json::to_string_pretty(&transfer)?.as_bytes())?;
+        report(json, &transfer, || {
+            println!("{text}");
+            println!("transfer.json is in {}", a.out.display());
+        })?;
+        return Ok(Outcome::Found);
+    }
     let experiences = a.out.join("experience.db");
     eprintln!("1 of 5: experience on synthetic objects");
     learn::learn(&LearnArguments {
@@ -147,28 +230,9 @@ pub(crate) fn run(a: &ReproduceDgcmArguments, json: &JsonArguments) -> Result<Ou
         json: JsonArguments::default(),
     })?;
     eprintln!("3 of 5: figure 6.7, against the number of experiences and between objects");
-    let setting = hardness(&physics(), true)?;
-    let network = model(&a.network)?;
-    let (objects, parts) = objects_with_parts(&a.objects())?;
-    let instances = offline::instances(&objects, &setting.gripper);
-    if instances.is_empty() {
-        bail!("{}: no object that {} could hold from above", a.list.display(), setting.gripper.name);
-    }
-    let size = if a.quick {
-        Size { views: 1, rounds: 1, stretched: 2 }
-    } else {
-        Size { views: 6, rounds: 5, stretched: 24 }
-    };
-    // Views as from a camera; the hand's error is not simulated here.
-    let answers = Offline {
-        instances: &instances,
-        network: &network,
-        gripper: &setting.gripper,
-        options: &setting.options,
-        size,
-        seed: a.seed,
-    }
-    .run(&a.out.join("offline"))?;
+    let context = Context::of(a)?;
+    let transfer = context.transfer(a)?;
+    let Context { setting, network, objects, parts, instances } = &context;
     eprintln!("4 of 5: figures 6.10 to 6.12, learning from nothing");
     let mut incremental = vec![];
     for (name, path) in objects.iter().map(|o| (&o.1, a.path_of(&o.1))) {
@@ -205,25 +269,11 @@ pub(crate) fn run(a: &ReproduceDgcmArguments, json: &JsonArguments) -> Result<Ou
         near: 0.0,
         ..a.learning("handles/learn", &handled, 4, vec![])
     })?;
-    let handles = Handles {
-        objects: &objects,
-        parts: &parts,
-        network: &network,
-        setting: &setting,
-        views: if a.quick { 2 } else { 10 },
-        seed: a.seed,
-    }
-    .run(&mut memory(&StorePlace::File(handled), &network)?, &a.out.join("handles"))?;
-    let whole = Whole {
-        quick: a.quick,
-        compare,
-        curves: points(&answers),
-        pairs: pairs(&instances, &answers),
-        stretched: stretched(&answers),
-        incremental,
-        handles,
-    };
-    whole.draw(&a.out, &instances)?;
+    let handles =
+        Handles { objects, parts, network, setting, views: if a.quick { 2 } else { 10 }, seed: a.seed }
+            .run(&mut memory(&StorePlace::File(handled), network)?, &a.out.join("handles"))?;
+    let whole = Whole { quick: a.quick, compare, transfer, incremental, handles };
+    whole.draw(&a.out, instances)?;
     let text = whole.markdown();
     write_atomically(&a.out.join("table.md"), text.as_bytes())?;
     write_atomically(&a.out.join("reproduce.json"), serde_json::to_string_pretty(&whole)?.as_bytes())?;
@@ -304,6 +354,13 @@ fn points(answers: &[Answer]) -> Vec<Point> {
     points
 }
 
+/// The mean over all classes for a number of experiences.
+fn mean_cell(curves: &[Point], count: usize, all: bool) -> String {
+    let some: Vec<&Point> = curves.iter().filter(|p| p.count == count && p.all_classes == all).collect();
+    let mean = |k: usize| some.iter().map(|p| p.within[k]).sum::<f64>() / some.len().max(1) as f64;
+    format!("{:.2} / {:.2}", mean(0), mean(1))
+}
+
 fn pairs(instances: &[Instance], answers: &[Answer]) -> Vec<Pair> {
     let mut pairs = vec![];
     for a in instances {
@@ -339,7 +396,7 @@ fn stretched(answers: &[Answer]) -> Vec<Stretched> {
         .collect()
 }
 
-impl Whole {
+impl Transfer {
     fn draw(&self, folder: &Path, instances: &[Instance]) -> Result<()> {
         for (k, name) in ["5 cm and 15 degrees", "1 cm and 10 degrees"].iter().enumerate() {
             let mut lines: Vec<Line> = vec![];
@@ -370,6 +427,54 @@ impl Whole {
             let picture = pictures::matrix(&title, &names, &fractions);
             write_rgb(&folder.join(format!("between-objects-{tag}.png")), &picture)?;
         }
+        Ok(())
+    }
+
+    fn add_markdown(&self, out: &mut String) {
+        *out += "\nNearness to the wanted grasp from above (figure 6.7): within 5 cm and 15 degrees / 1 cm and 10 degrees\n\n";
+        let heads: Vec<String> = COUNTS.iter().map(|n| format!("{n} per object")).collect();
+        let _ = writeln!(out, "| class | experience of | {} |", heads.join(" | "));
+        let _ = writeln!(out, "|---|---|{}", "---|".repeat(COUNTS.len()));
+        let mut add = |curves: &[Point], of: [&str; 2]| {
+            for row in curves.chunks(COUNTS.len()) {
+                let Some(first) = row.first() else { continue };
+                let of = of[usize::from(first.all_classes)];
+                let cells: Vec<String> =
+                    row.iter().map(|p| format!("{:.2} / {:.2}", p.within[0], p.within[1])).collect();
+                let _ = writeln!(out, "| {} | {of} | {} |", first.class, cells.join(" | "));
+            }
+            for all in [false, true].into_iter().filter(|_| !curves.is_empty()) {
+                let cells: Vec<String> = COUNTS.iter().map(|n| mean_cell(curves, *n, all)).collect();
+                let _ = writeln!(out, "| mean | {} | {} |", of[usize::from(all)], cells.join(" | "));
+            }
+        };
+        add(&self.curves, ["its class", "all classes"]);
+        add(&self.curves_alone, ["its class, network alone", "all classes, network alone"]);
+        let mean_pair = |same: bool| {
+            let some: Vec<&Pair> = self.pairs.iter().filter(|p| (p.from == p.to) == same).collect();
+            let mean = |k: usize| some.iter().map(|p| p.within[k]).sum::<f64>() / some.len().max(1) as f64;
+            format!("{:.2} / {:.2}", mean(0), mean(1))
+        };
+        let _ = writeln!(
+            out,
+            "\nAll experience of one object, grasp on the same one {}, on another {} (between-objects-5cm.png)\n",
+            mean_pair(true),
+            mean_pair(false)
+        );
+        *out += "Experience of an object, grasp on the same one stretched along each axis\n\n| largest change of an axis | views | within |\n|---|---|---|\n";
+        for s in &self.stretched {
+            let _ = writeln!(
+                out,
+                "| up to {:.1} times | {} | {:.2} / {:.2} |",
+                s.up_to, s.asked, s.within[0], s.within[1]
+            );
+        }
+    }
+}
+
+impl Whole {
+    fn draw(&self, folder: &Path, instances: &[Instance]) -> Result<()> {
+        self.transfer.draw(folder, instances)?;
         let first: Vec<(&str, &Curve)> =
             self.incremental.iter().filter_map(|o| Some((o.setting(), o.curves.first()?))).collect();
         let picture = pictures::incremental(&first, NEAR);
@@ -416,36 +521,7 @@ impl Whole {
         let _ = writeln!(out, "| mean without {} | | {} |", HARDLY.join(" and "), mean(&HARDLY).join(" | "));
         let seconds: Vec<String> = c.median_seconds.iter().map(|s| format!("{s:.2}")).collect();
         let _ = writeln!(out, "| median seconds to ranked grasps | | {} |", seconds.join(" | "));
-        out += "\nNearness to the wanted grasp from above (figure 6.7): within 5 cm and 15 degrees / 1 cm and 10 degrees\n\n";
-        let heads: Vec<String> = COUNTS.iter().map(|n| format!("{n} per object")).collect();
-        let _ = writeln!(out, "| class | experience of | {} |", heads.join(" | "));
-        let _ = writeln!(out, "|---|---|{}", "---|".repeat(COUNTS.len()));
-        for row in self.curves.chunks(COUNTS.len()) {
-            let Some(first) = row.first() else { continue };
-            let of = if first.all_classes { "all classes" } else { "its class" };
-            let cells: Vec<String> =
-                row.iter().map(|p| format!("{:.2} / {:.2}", p.within[0], p.within[1])).collect();
-            let _ = writeln!(out, "| {} | {of} | {} |", first.class, cells.join(" | "));
-        }
-        let mean_pair = |same: bool| {
-            let some: Vec<&Pair> = self.pairs.iter().filter(|p| (p.from == p.to) == same).collect();
-            let mean = |k: usize| some.iter().map(|p| p.within[k]).sum::<f64>() / some.len().max(1) as f64;
-            format!("{:.2} / {:.2}", mean(0), mean(1))
-        };
-        let _ = writeln!(
-            out,
-            "\nAll experience of one object, grasp on the same one {}, on another {} (between-objects-5cm.png)\n",
-            mean_pair(true),
-            mean_pair(false)
-        );
-        out += "Experience of an object, grasp on the same one stretched along each axis\n\n| largest change of an axis | views | within |\n|---|---|---|\n";
-        for s in &self.stretched {
-            let _ = writeln!(
-                out,
-                "| up to {:.1} times | {} | {:.2} / {:.2} |",
-                s.up_to, s.asked, s.within[0], s.within[1]
-            );
-        }
+        self.transfer.add_markdown(&mut out);
         out += "\nLearning from nothing (figures 6.10 to 6.12): attempts of the first run in their order, G geometry, E experience, capitals held; successes of all runs\n\n| object | setting | attempts | held after the second success |\n|---|---|---|---|\n";
         for of_object in &self.incremental {
             let Some(first) = of_object.curves.first() else { continue };

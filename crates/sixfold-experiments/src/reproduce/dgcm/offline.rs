@@ -129,6 +129,8 @@ pub(super) struct Offline<'a> {
     pub gripper: &'a Gripper,
     pub options: &'a AttemptOptions,
     pub size: Size,
+    /// By the network alone, in the published form ([`ProposeOptions::published`]).
+    pub alone: bool,
     pub seed: u64,
 }
 
@@ -137,7 +139,7 @@ impl Offline<'_> {
     pub fn run(&self, folder: &Path) -> Result<Vec<Answer>> {
         let recorded = serde_json::json!({
             "objects": self.instances.iter().map(|i| i.name.as_str()).collect::<Vec<_>>(),
-            "size": self.size, "seed": self.seed, "network": self.network.fingerprint(), "gripper": self.gripper,
+            "size": self.size, "seed": self.seed, "alone": self.alone, "network": self.network.fingerprint(), "gripper": self.gripper,
         });
         let (mut journal, rows) = Journal::open::<Answer>(&folder.join("answers.jsonl"), &recorded)?;
         let mut answers: BTreeMap<Question, Answer> =
@@ -276,7 +278,8 @@ impl Offline<'_> {
     fn ask(&self, memory: &mut Memory, test: &View, only: BTreeSet<i64>) -> Result<Option<(f64, f64)>> {
         let options = AntipodalOptions::default();
         let fitter = GraspFitter::new(&test.view, self.gripper, &options)?;
-        let options = ProposeOptions { only: Some(only), ..ProposeOptions::default() };
+        let form = if self.alone { ProposeOptions::published() } else { ProposeOptions::default() };
+        let options = ProposeOptions { only: Some(only), ..form };
         let found = propose(&fitter, self.network, memory, &options)?;
         Ok(rank(&[], &found.proposals, &ClusterOptions::default()).first().map(|best| {
             let wanted = &test.wanted;
