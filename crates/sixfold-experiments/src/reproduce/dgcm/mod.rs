@@ -15,7 +15,7 @@ use sixfold_experience::StorePlace;
 use sixfold_io::write_rgb;
 
 use self::handles::Handles;
-use self::offline::{Answer, COUNTS, Instance, Offline, Question, Size};
+use self::offline::{Answer, COUNTS, Form, Instance, Offline, Question, Size};
 use self::pictures::Line;
 use crate::grasp::compare::{self, CompareArguments};
 use crate::grasp::ways::METHODS;
@@ -26,8 +26,8 @@ use sixfold_shell::grasp::object_list::{Named, ObjectsArguments, PartBox, file_n
 use sixfold_shell::grasp::trial::{Hardness, PhysicsArguments, hardness};
 use sixfold_shell::output::{JsonArguments, report, write_atomically};
 
-/// Values of `--figure`: figure 6.7 in both forms, and by the network alone.
-const TRANSFER: [&str; 2] = ["6.7", "6.7-network"];
+/// Values of `--figure`: figure 6.7 in all forms, by the network alone, and as published.
+const TRANSFER: [&str; 3] = ["6.7", "6.7-network", "6.7-published"];
 /// Largest feature distance at which experience proposes a grasp (dissertation, section 6.3.2).
 const NEAR: f64 = 0.9;
 /// Runs of learning from an empty store, each with its own seed.
@@ -50,7 +50,8 @@ pub(crate) struct ReproduceDgcmArguments {
     /// Few scenes and views, for a quick check
     #[arg(long)]
     pub quick: bool,
-    /// Measure only this figure of the dissertation, the errors of transferred grasps: in both forms, or by the network alone
+    /// Measure only this figure of the dissertation, the errors of transferred grasps: in all forms, by the network's
+    /// hypotheses alone, or as published
     #[arg(long, value_name = "FIGURE", value_parser = TRANSFER)]
     pub figure: Option<String>,
     #[command(flatten)]
@@ -77,8 +78,10 @@ struct Whole {
 #[derive(Serialize)]
 struct Transfer {
     curves: Vec<Point>,
-    /// The same by the network alone, in the published form.
-    curves_alone: Vec<Point>,
+    /// The same by the network's hypotheses alone.
+    curves_network: Vec<Point>,
+    /// The same in the published form, with the gripper at a fixed distance from the surface.
+    curves_published: Vec<Point>,
     pairs: Vec<Pair>,
     stretched: Vec<Stretched>,
 }
@@ -158,32 +161,35 @@ impl Context {
 
     /// Figure 6.7 in both forms.
     fn transfer(&self, a: &ReproduceDgcmArguments) -> Result<Transfer> {
-        let only_alone = a.figure.as_deref() == Some(TRANSFER[1]);
+        let wanted = |form| a.figure.as_deref().is_none_or(|f| f == TRANSFER[0] || f == TRANSFER[form]);
         let size = if a.quick {
             Size { views: 1, rounds: 1, stretched: 2 }
         } else {
             Size { views: 6, rounds: 5, stretched: 24 }
         };
         // Views as from a camera; the hand's error is not simulated here.
-        let answers = |alone, folder| {
+        let answers = |form, folder| {
             Offline {
                 instances: &self.instances,
                 network: &self.network,
                 gripper: &self.setting.gripper,
                 options: &self.setting.options,
                 size,
-                alone,
+                form,
                 seed: a.seed,
             }
             .run(&a.out.join(folder))
         };
-        let ours = if only_alone { vec![] } else { answers(false, "offline")? };
-        let alone = answers(true, "offline-alone")?;
-        // Pairs and stretched copies: by the network alone only where nothing else was measured.
-        let shown = if only_alone { &alone } else { &ours };
+        let ours = if wanted(0) { answers(Form::Ours, "offline")? } else { vec![] };
+        let network = if wanted(1) { answers(Form::Network, "offline-network")? } else { vec![] };
+        let published = if wanted(2) { answers(Form::Published, "offline-published")? } else { vec![] };
+        // Pairs and stretched copies are shown in one form.
+        let shown = [&ours, &network, &published].into_iter().find(|answers| !answers.is_empty());
+        let shown = shown.map_or(&[][..], Vec::as_slice);
         Ok(Transfer {
             curves: points(&ours),
-            curves_alone: points(&alone),
+            curves_network: points(&network),
+            curves_published: points(&published),
             pairs: pairs(&self.instances, shown),
             stretched: stretched(shown),
         })
@@ -449,7 +455,8 @@ impl Transfer {
             }
         };
         add(&self.curves, ["its class", "all classes"]);
-        add(&self.curves_alone, ["its class, network alone", "all classes, network alone"]);
+        add(&self.curves_network, ["its class, network alone", "all classes, network alone"]);
+        add(&self.curves_published, ["its class, as published", "all classes, as published"]);
         let mean_pair = |same: bool| {
             let some: Vec<&Pair> = self.pairs.iter().filter(|p| (p.from == p.to) == same).collect();
             let mean = |k: usize| some.iter().map(|p| p.within[k]).sum::<f64>() / some.len().max(1) as f64;

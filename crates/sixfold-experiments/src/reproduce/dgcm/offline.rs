@@ -122,6 +122,18 @@ pub(super) struct Size {
     pub stretched: u64,
 }
 
+/// How grasps are transferred.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub(super) enum Form {
+    /// The default: all hypotheses.
+    Ours,
+    /// The network's hypothesis alone; the gripper is placed where it is free.
+    Network,
+    /// The same with the gripper at a fixed distance from the surface ([`ProposeOptions::published`]).
+    Published,
+}
+
 /// The inputs of the offline experiments.
 pub(super) struct Offline<'a> {
     pub instances: &'a [Instance],
@@ -129,8 +141,7 @@ pub(super) struct Offline<'a> {
     pub gripper: &'a Gripper,
     pub options: &'a AttemptOptions,
     pub size: Size,
-    /// By the network alone, in the published form ([`ProposeOptions::published`]).
-    pub alone: bool,
+    pub form: Form,
     pub seed: u64,
 }
 
@@ -139,7 +150,7 @@ impl Offline<'_> {
     pub fn run(&self, folder: &Path) -> Result<Vec<Answer>> {
         let recorded = serde_json::json!({
             "objects": self.instances.iter().map(|i| i.name.as_str()).collect::<Vec<_>>(),
-            "size": self.size, "seed": self.seed, "alone": self.alone, "network": self.network.fingerprint(), "gripper": self.gripper,
+            "size": self.size, "seed": self.seed, "form": self.form, "network": self.network.fingerprint(), "gripper": self.gripper,
         });
         let (mut journal, rows) = Journal::open::<Answer>(&folder.join("answers.jsonl"), &recorded)?;
         let mut answers: BTreeMap<Question, Answer> =
@@ -278,7 +289,11 @@ impl Offline<'_> {
     fn ask(&self, memory: &mut Memory, test: &View, only: BTreeSet<i64>) -> Result<Option<(f64, f64)>> {
         let options = AntipodalOptions::default();
         let fitter = GraspFitter::new(&test.view, self.gripper, &options)?;
-        let form = if self.alone { ProposeOptions::published() } else { ProposeOptions::default() };
+        let form = match self.form {
+            Form::Ours => ProposeOptions::default(),
+            Form::Network => ProposeOptions { reach: None, ..ProposeOptions::published() },
+            Form::Published => ProposeOptions::published(),
+        };
         let options = ProposeOptions { only: Some(only), ..form };
         let found = propose(&fitter, self.network, memory, &options)?;
         Ok(rank(&[], &found.proposals, &ClusterOptions::default()).first().map(|best| {
