@@ -29,6 +29,10 @@ fn the_tables_of_chapter_6_are_made_and_kept() {
     assert_eq!(curves.len(), 8, "{curves:?}");
     assert!(curves.iter().all(|c| c["asked"].as_u64().unwrap() > 0), "{curves:?}");
     assert_eq!(json["pairs"].as_array().unwrap().len(), 1);
+    // The same by the network alone, with the gripper where it is free and as published.
+    for form in ["curves_network", "curves_published"] {
+        assert_eq!(json[form].as_array().map(Vec::len), Some(8), "{}", json[form]);
+    }
     let table = std::fs::read_to_string(dir.join("out/table.md")).unwrap();
     let head =
         "| class | scenes | geometry | experience | network | published | agreement | outcomes | both |";
@@ -42,6 +46,15 @@ fn the_tables_of_chapter_6_are_made_and_kept() {
     for file in ["experience-5cm.png", "between-objects-1cm.png", "incremental.png", "reproduce.json"] {
         assert!(dir.join("out").join(file).is_file(), "{file}");
     }
+    // One of the forms alone.
+    let figure = command.replace("--out out", "--out figure --figure 6.7-published");
+    let figure = sixfold(dir, &figure).expect(0).json();
+    assert_eq!(figure["curves_published"], json["curves_published"]);
+    assert_eq!(
+        (&figure["curves"], &figure["curves_network"]),
+        (&serde_json::json!([]), &serde_json::json!([]))
+    );
+    assert!(dir.join("figure/transfer.json").is_file() && !dir.join("figure/compare").exists());
     // Run again: everything exists already.
     let trials = std::fs::read(dir.join("out/compare/trials.jsonl")).unwrap();
     let again = sixfold(dir, &command).expect(0).json();

@@ -15,6 +15,8 @@ fn a_reproduction_resumes() {
         "both-printed-score",
         "network",
         "network-nearest",
+        "network-masks",
+        "network-masks-verified",
         "published",
         "points",
         "points-nearest",
@@ -22,7 +24,7 @@ fn a_reproduction_resumes() {
     ] {
         assert!(keys.contains(&key), "{key} of {keys:?}");
     }
-    assert_eq!((keys.len(), keys[0]), (12, "both"));
+    assert_eq!((keys.len(), keys[0]), (14, "both"));
     assert!(whole["rows"][0]["all"]["add_s"].as_f64().unwrap() > 0.6, "{whole}");
     assert!(whole["rows"][0]["all"]["iou"].as_f64().unwrap() > 0.6, "{whole}");
     let table = std::fs::read_to_string(dir.join("reproduced/table.md")).unwrap();
@@ -54,4 +56,15 @@ fn a_reproduction_resumes() {
         assert_eq!(several["rows"][0]["all"][score], whole["rows"][0]["all"][score], "{several}");
     }
     fails(dir, "reproduce mttm --dataset tiny --out reproduced --no-ppf", &["reproduced", "other inputs"]);
+    // Some rows alone have the same scores.
+    let rows = "reproduce mttm --dataset tiny --out rows --no-ppf --rows network-masks,both --json";
+    let rows = sixfold(dir, rows).expect(0).json();
+    let scores = |of: &serde_json::Value, key: &str| {
+        of["rows"].as_array().unwrap().iter().find(|row| row["key"] == key).unwrap()["all"].clone()
+    };
+    assert_eq!(rows["rows"].as_array().unwrap().len(), 2);
+    for key in ["network-masks", "both"] {
+        assert_eq!(scores(&rows, key), scores(&several, key), "{key}");
+    }
+    fails(dir, "reproduce mttm --dataset tiny --out rows --rows other", &["other", "--rows"]);
 }
