@@ -25,7 +25,7 @@ impl MttmEstimator {
 
 /// An empty cache.
 #[derive(Debug, Default)]
-pub(crate) struct RegionCache;
+pub(crate) struct RegionCache {}
 
 pub(crate) fn first_matching(
     _scene: &DepthRegion,

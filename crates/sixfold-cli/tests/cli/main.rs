@@ -38,6 +38,7 @@ mod synthesize;
 mod teach;
 #[cfg(feature = "networks")]
 mod teach_and_train;
+#[cfg(feature = "networks")]
 mod teach_without_board;
 #[cfg(feature = "networks")]
 mod trainings;
