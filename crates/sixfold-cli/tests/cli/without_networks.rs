@@ -13,7 +13,7 @@ fn commands_that_need_networks_name_the_feature() {
         ("synthesize --dataset tiny --out out".to_owned(), ""),
         (mttm("--matcher both"), "--matcher both"),
         (mttm("--masks network"), "--masks network"),
-        (mttm("--weights model.safetensors"), "--weights"),
+        (mttm("--matcher network --weights model.safetensors"), "--weights"),
     ];
     for (command, option) in refused {
         fails(case.path(), &command, &[option, "without the feature networks"]);
