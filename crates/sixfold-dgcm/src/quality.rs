@@ -1,4 +1,5 @@
-//! How well a network predicts coordinates of objects that it was not trained on.
+//! How well a network predicts coordinates of objects that it was not trained on: the error of equation 6.3 on the object
+//! (dissertation, section 6.2.2).
 
 use std::collections::BTreeMap;
 

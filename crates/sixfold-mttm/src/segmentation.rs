@@ -27,6 +27,8 @@ use crate::roi::Roi;
 /// Regions of the first matching that are compared with their templates as pairs: those with the nearest templates. Chosen by hand;
 /// not swept.
 const COMPARED: usize = 200;
+/// Most probable matches of all rounds whose masks are compared; chosen by hand for run time, not swept.
+const MASKED: usize = 200;
 /// Regions that are centred and matched again in each round, those with the most probable matches. Chosen by hand; not swept.
 const CENTRED: usize = 40;
 /// Smallest distance of their centres, as a fraction of the diameter; chosen by hand, not swept.
@@ -84,7 +86,7 @@ pub(crate) fn hypotheses(
         candidates.extend(last.iter().cloned());
     }
     sort(&mut candidates);
-    candidates.truncate(COMPARED);
+    candidates.truncate(MASKED);
     let size = learned.size();
     let masks: Vec<Pixels> =
         candidates.par_iter().map(|c| mask_pixels(scene, &c.roi, size, &c.output.mask, 1)).collect();
