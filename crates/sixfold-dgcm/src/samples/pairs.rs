@@ -233,6 +233,24 @@ mod tests {
     }
 
     #[test]
+    fn what_a_block_leaves_of_a_view_is_normalised_by_itself() {
+        let pool = pool();
+        let options = PairOptions { noise: 0.0, occlusion: 0.9, ..PairOptions::default() };
+        let pixels = 96 * 96;
+        for number in 0..12 {
+            let pair = pool.pair(true, &options, 5, number);
+            for planes in [&pair.input, &pair.experience] {
+                for k in 3..6 {
+                    let plane = &planes[k * pixels..(k + 1) * pixels];
+                    let (low, high) = plane.iter().fold((0f32, 0f32), |(a, b), v| (a.min(*v), b.max(*v)));
+                    assert!(low < -0.99 && high > 0.99, "pair {number}, plane {k}: {low} to {high}");
+                }
+            }
+            assert_eq!(pair.vd_noc, pair.experience[3 * pixels..]);
+        }
+    }
+
+    #[test]
     fn pairs_keep_to_their_kind_and_to_their_seed() {
         let pool = pool();
         let options = PairOptions::default();
