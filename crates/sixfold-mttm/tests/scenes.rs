@@ -262,7 +262,8 @@ fn the_network_alone_gives_masks_that_no_alignment_changes() {
         }
     }
     println!("{overlaps:.2?} {right}");
-    assert!(overlaps.iter().filter(|o| **o > 0.5).count() >= 3, "{overlaps:.2?}");
+    // Measured: 0.65, 0.93, 0.90, 0.83; without matching again the third is 0.
+    assert!(overlaps.iter().all(|o| *o > 0.5), "{overlaps:.2?}");
     assert!(right >= 3, "{right} of 4");
 }
 
