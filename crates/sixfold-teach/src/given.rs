@@ -6,7 +6,7 @@ use crate::cones::{Cone, volume_of_masks};
 use crate::error::TeachError;
 use crate::reduce::undistorted;
 use crate::shape::{Capture, NOT_IN_SIGHT, Segmentation, ShapeOptions};
-use crate::silhouette::{Segmenter, without_specks};
+use crate::silhouette::{SMALLEST_HOLE, Segmenter, without_specks};
 use crate::view::{PosedPhotograph, Volume};
 
 /// The volume of the object from masks: the given ones or, if there are none, the salient regions of whole photographs.
@@ -48,7 +48,7 @@ impl Masked {
         side: usize,
     ) -> Result<Masked, Box<dyn std::error::Error + Send + Sync>> {
         let (image, camera) = undistorted(&p.image, Some(&p.camera), side);
-        let mask = without_specks(&segmenter.foreground(&image)?.map(|p| *p > 0.5));
+        let mask = without_specks(&segmenter.foreground(&image)?.map(|p| *p > 0.5), SMALLEST_HOLE);
         Ok(Masked { camera: camera.unwrap_or(p.camera), pose: p.camera_from_world, mask, unknown: None })
     }
 

@@ -27,7 +27,7 @@ impl<'a> Outlined<'a> {
     }
 
     /// How far a point is outside the cones of the outer border and of the mask, metres; `None` if it is not in the view.
-    fn outside(&self, point: &Vec3) -> Option<[f32; 2]> {
+    pub fn outside(&self, point: &Vec3) -> Option<[f32; 2]> {
         let (pixel, depth) = self.view.project(point)?;
         let scale = (depth / self.view.camera.fx) as f32;
         let outer = bilinear(&self.outer, pixel.x, pixel.y) * scale;

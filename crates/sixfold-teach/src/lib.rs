@@ -11,8 +11,10 @@
 //! of the plane on which the object stands. The object's frame has its origin at the centre of the mesh's box and the same axes.
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
+mod border;
 mod by_features;
 mod cones;
+mod cut;
 mod distance;
 mod error;
 mod fusion;

@@ -207,7 +207,7 @@ pub fn segment(
     let shape = only_largest(&shape).ok_or_else(no_object)?;
     let numbers: Vec<usize> = views.iter().map(|v| v.0).collect();
     let views: Vec<(View, Cues)> = views.into_iter().map(|(_, v, c)| (v, c)).collect();
-    let found = masks(&views, &shape);
+    let found = masks(&views, &shape, capture.floor());
     let (kept, left_out) = consistent(&views, found, &numbers, &around, capture, options)?;
     let mut whole = vec![None; capture.photographs.len()];
     for (number, view, mask) in &kept {

@@ -10,6 +10,7 @@ use sixfold_geometry::{Image, Mask, Plane, RgbImage, Vec3};
 use sixfold_nn::salient::SalientNetwork;
 use sixfold_nn::weights::WeightsError;
 
+use crate::border::exact;
 use crate::grid::Grid;
 use crate::view::{View, Volume, bilinear};
 
@@ -19,6 +20,8 @@ const MOST: f32 = 3.0;
 const DISSENT: f64 = 0.15;
 /// Radius of the guided filter, pixels, and its regularisation (squared grey levels from 0 to 1).
 const FILTER: (usize, f32) = (5, 1e-3);
+/// Holes of fewer pixels than this fraction (one divided by it) of a rough mask are closed.
+pub(crate) const SMALLEST_HOLE: usize = 50;
 /// Bins per channel of the histograms of colours.
 const BINS: usize = 12;
 
@@ -56,6 +59,8 @@ pub(crate) struct Cues {
     pub salience: Image<f32>,
     /// Log-odds from the board; 0 where the board gives no information.
     pub board: Image<f32>,
+    /// What the view would show of the bare board.
+    pub bare: Option<Bare>,
 }
 
 pub(crate) fn log_odds(p: f32) -> f32 {
@@ -76,12 +81,18 @@ impl Cues {
                 false => -MOST,
             });
             let nothing = Image::filled(mask.width(), mask.height(), 0.0);
-            return Ok(Cues { salience: certain, board: nothing });
+            return Ok(Cues { salience: certain, board: nothing, bare: None });
         }
         let salience = segmenter.foreground(&view.image)?.map(|p| log_odds(*p));
         let (w, h) = view.image.size();
-        let board = board.map_or_else(|| Image::filled(w, h, 0.0), |board| board_cue(view, board));
-        Ok(Cues { salience, board })
+        let (board, bare) = match board {
+            Some(board) => {
+                let (odds, bare) = board_cue(view, board);
+                (odds, Some(bare))
+            }
+            None => (Image::filled(w, h, 0.0), None),
+        };
+        Ok(Cues { salience, board, bare })
     }
 
     /// The sum of both.
@@ -112,9 +123,18 @@ const RARE: f32 = 0.03;
 const DARKEST_SHADOW: f32 = 0.3;
 /// Relative difference of the colour channels from those of paper above which a pixel is neither paper nor ink.
 const TINT: f32 = 0.25;
+/// Standard deviations on the bare board, grey levels: of a pixel, and of the difference between its colour channels. Chosen by hand.
+const LEVEL: f32 = 8.0;
+const TINTED: f32 = 10.0;
+/// Standard deviation at an edge between ink and paper, as a fraction of their difference, from the error of the board's pose: of a pixel
+/// whose surroundings count, and of one that counts by itself. Chosen by hand.
+const EDGE: f32 = 0.25;
+const OWN_EDGE: f32 = 0.15;
+/// Likelihood of a shadow on paper, relative to lit paper. Chosen by hand.
+const SHADOW: f32 = 0.5;
 
-/// Log-odds from the comparison of each pixel and its surroundings with the bare board.
-fn board_cue(view: &View, board: &Board) -> Image<f32> {
+/// Log-odds from the comparison of each pixel and its surroundings with the bare board, and the bare board.
+fn board_cue(view: &View, board: &Board) -> (Image<f32>, Bare) {
     let (width, height) = view.image.size();
     let printed = printed(view, board);
     let known = printed.map(|p| f32::from(u8::from(p.is_some())));
@@ -138,7 +158,9 @@ fn board_cue(view: &View, board: &Board) -> Image<f32> {
         };
         around = combined(&of(false), &of(true), f32::min);
     }
-    Image::from_fn(width, height, |x, y| {
+    let light = Light::on_board(view, &printed, &around, 4 * radius);
+    let bare = Bare::new(view, &printed, &light);
+    let odds = Image::from_fn(width, height, |x, y| {
         if known[(x, y)] == 0.0 {
             return 0.0;
         }
@@ -152,7 +174,36 @@ fn board_cue(view: &View, board: &Board) -> Image<f32> {
         // In a partly covered square the pixel itself decides.
         let of_pixel = if agrees[(x, y)] < 0.5 { 1.5 } else { -1.0 };
         (of_square + of_pixel).clamp(-4.0, MOST)
-    })
+    });
+    (odds, bare)
+}
+
+/// The bare board as a view would show it.
+pub(crate) struct Bare {
+    /// How likely each pixel shows the bare board, relative to the most likely colour, 0 to 1, and the colour of the bare board; `None`
+    /// outside the board.
+    pixels: Vec<Option<(f32, [u8; 3])>>,
+}
+
+impl Bare {
+    fn new(view: &View, printed: &Image<Option<f32>>, light: &Light) -> Bare {
+        let (w, h) = view.image.size();
+        let pixel = |i: usize| {
+            let (at, white) = ((i % w, i / w), printed.as_slice()[i]?);
+            Some((light.likelihood(at, view.image[at], white), light.expected(at, white)))
+        };
+        Bare { pixels: (0..w * h).map(pixel).collect() }
+    }
+
+    /// How likely a pixel shows the bare board, relative to the most likely colour, 0 to 1; `None` outside the board.
+    pub fn likelihood(&self, i: usize) -> Option<f32> {
+        self.pixels[i].map(|(likelihood, _)| likelihood)
+    }
+
+    /// The colour of the bare board at a pixel; `None` outside it.
+    pub fn expected(&self, i: usize) -> Option<[u8; 3]> {
+        self.pixels[i].map(|(_, color)| color)
+    }
 }
 
 /// The brightness of paper and ink around each pixel.
@@ -211,25 +262,54 @@ impl Light {
         Light { paper, ink, tint, contrast }
     }
 
+    /// The grey level of a pixel of the bare board.
+    fn level(&self, at: (usize, usize), white: f32) -> f32 {
+        white * self.paper[at] + (1.0 - white) * self.ink[at]
+    }
+
+    /// The colour of a pixel of the bare board.
+    fn expected(&self, at: (usize, usize), white: f32) -> [u8; 3] {
+        let [red, blue] = self.tint;
+        let green = self.level(at, white) / (0.299 * red + 0.587 + 0.114 * blue);
+        [red * green, green, blue * green].map(|c| c.round() as u8)
+    }
+
+    /// Whether a grey level may be that of a shadow on paper.
+    fn is_shadow(&self, at: (usize, usize), seen: f32, white: f32) -> bool {
+        let (paper, ink) = (self.paper[at], self.ink[at]);
+        white > 0.5 && seen < self.level(at, white) && seen > ink + DARKEST_SHADOW * white * (paper - ink)
+    }
+
+    /// The larger difference of red and of blue from what they are on paper and ink, grey levels.
+    fn tinted(&self, color: [u8; 3]) -> f32 {
+        let [r, g, b] = color.map(f32::from);
+        (r - self.tint[0] * g).abs().max((b - self.tint[1] * g).abs())
+    }
+
+    /// The likelihood of a colour where the board is bare, relative to the most likely one.
+    fn likelihood(&self, at: (usize, usize), color: [u8; 3], white: f32) -> f32 {
+        let seen = grey(color);
+        let deviation = LEVEL + OWN_EDGE * self.contrast[at] * (self.paper[at] - self.ink[at]).abs();
+        let bell = |deviations: f32| (-0.5 * deviations * deviations).exp();
+        let of_level = bell((seen - self.level(at, white)) / deviation);
+        let of_level = if self.is_shadow(at, seen, white) { of_level.max(SHADOW) } else { of_level };
+        of_level * bell(self.tinted(color) / TINTED)
+    }
+
     /// 1 if a pixel agrees with the print, 0 if it does not.
     fn agreement(&self, at: (usize, usize), color: [u8; 3], white: f32) -> f32 {
         let (paper, ink) = (self.paper[at], self.ink[at]);
         let seen = grey(color);
-        let expected = white * paper + (1.0 - white) * ink;
-        let [r, g, b] = color.map(f32::from);
-        let tinted = (r - self.tint[0] * g).abs().max((b - self.tint[1] * g).abs());
-        if tinted > TINT * paper.max(1.0) {
+        if self.tinted(color) > TINT * paper.max(1.0) {
             return 0.0;
         }
         // Noise, and an error of the board's pose by a fraction of a pixel at edges between ink and paper.
-        let deviation = 12.0 + 0.25 * self.contrast[at] * (paper - ink).abs();
-        let above = (seen - expected) / deviation;
-        if above.abs() < 2.0 {
+        let deviation = 12.0 + EDGE * self.contrast[at] * (paper - ink).abs();
+        if ((seen - self.level(at, white)) / deviation).abs() < 2.0 {
             return 1.0;
         }
         // A shadow makes paper darker.
-        let shadow = above < 0.0 && seen > ink + DARKEST_SHADOW * white * (paper - ink);
-        if shadow && white > 0.5 { 0.7 } else { 0.0 }
+        if self.is_shadow(at, seen, white) { 0.7 } else { 0.0 }
     }
 }
 
@@ -395,10 +475,10 @@ pub(crate) fn mask(view: &View, cues: &Cues, shape: &Grid) -> Mask {
     });
     let smooth = guided(&p, &view.image);
     let mask = Image::from_fn(w, h, |x, y| grown[(x, y)] && smooth[(x, y)] > 0.5);
-    without_specks(&mask)
+    without_specks(&mask, SMALLEST_HOLE)
 }
 
-fn shape_centre(shape: &Grid) -> Vec3 {
+pub(crate) fn shape_centre(shape: &Grid) -> Vec3 {
     let last = shape.point(shape.size.map(|n| n - 1));
     (shape.low + last) * 0.5
 }
@@ -411,8 +491,9 @@ pub(crate) fn covered(view: &View, shape: &Grid) -> Mask {
     depth.map(|d| *d > 0.0)
 }
 
-/// The largest part of a mask and others of at least a fifth of it, with holes of fewer pixels than a fiftieth filled.
-pub(crate) fn without_specks(mask: &Mask) -> Mask {
+/// The largest part of a mask and others of at least a fifth of it, with holes of fewer pixels than the largest part divided by
+/// `smallest_hole` filled.
+pub(crate) fn without_specks(mask: &Mask, smallest_hole: usize) -> Mask {
     let inside = parts(mask, true);
     let largest = inside.first().map_or(0, Vec::len);
     let (w, h) = mask.size();
@@ -420,7 +501,7 @@ pub(crate) fn without_specks(mask: &Mask) -> Mask {
     for part in inside.iter().filter(|p| 5 * p.len() >= largest) {
         part.iter().for_each(|i| out.as_mut_slice()[*i] = true);
     }
-    let small = largest / 50;
+    let small = largest / smallest_hole;
     for hole in parts(&out, false).iter().filter(|hole| hole.len() <= small) {
         hole.iter().for_each(|i| out.as_mut_slice()[*i] = true);
     }
@@ -473,8 +554,9 @@ fn parts(mask: &Mask, of: bool) -> Vec<Vec<usize>> {
 }
 
 /// Masks of all views.
-pub(crate) fn masks(views: &[(View, Cues)], shape: &Grid) -> Vec<Mask> {
-    views.par_iter().map(|(view, cues)| mask(view, cues, shape)).collect()
+pub(crate) fn masks(views: &[(View, Cues)], shape: &Grid, floor: Option<Plane>) -> Vec<Mask> {
+    let rough: Vec<Mask> = views.par_iter().map(|(view, cues)| mask(view, cues, shape)).collect();
+    exact(views, &rough, shape, floor)
 }
 
 #[cfg(test)]
@@ -507,7 +589,7 @@ mod tests {
         let mask = Image::from_fn(60, 60, |x, y| {
             (disc(x, y, 30.0, 30.0, 20.0) && !disc(x, y, 25.0, 25.0, 2.0)) || disc(x, y, 55.0, 5.0, 3.0)
         });
-        let clean = without_specks(&mask);
+        let clean = without_specks(&mask, 50);
         assert!(clean[(25, 25)] && !clean[(55, 5)] && clean[(30, 45)] && !clean[(2, 2)]);
     }
 }
