@@ -237,3 +237,57 @@ impl Edges {
         if diagonal { cost * std::f32::consts::FRAC_1_SQRT_2 } else { cost }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use sixfold_geometry::{Camera, Pose, Vec3};
+
+    use super::*;
+
+    const SIDE: usize = 40;
+
+    fn view(color: impl Fn(usize, usize) -> [u8; 3]) -> View {
+        let camera =
+            Camera { fx: 40.0, fy: 40.0, cx: 20.0, cy: 20.0, width: SIDE, height: SIDE, distortion: None };
+        let camera_from_world = Pose::from_translation(Vec3::new(0.0, 0.0, 0.5));
+        let eye = camera_from_world.inverse().translation();
+        let image = Image::from_fn(SIDE, SIDE, color);
+        View { image, camera, camera_from_world, eye, depth: None, mask: None, hidden: None }
+    }
+
+    fn cues(bare: Option<Bare>) -> Cues {
+        let nothing = Image::filled(SIDE, SIDE, 0.0);
+        Cues { salience: nothing.clone(), board: nothing, bare }
+    }
+
+    fn square(from: usize, to: usize) -> Mask {
+        Image::from_fn(SIDE, SIDE, |x, y| (from..to).contains(&x) && (from..to).contains(&y))
+    }
+
+    #[test]
+    fn a_border_follows_colours() {
+        let truth = square(10, 30);
+        let view = view(|x, y| if truth[(x, y)] { [200, 40, 40] } else { [60, 70, 60] });
+        // The rough mask is three pixels too large on all sides.
+        let rough = square(7, 33);
+        assert_eq!(cut(&view, &cues(None), &rough, &rough, None), truth);
+    }
+
+    #[test]
+    fn an_edge_of_the_print_is_no_edge_where_the_board_is_bare() {
+        // Ink on the left, paper on the right; an object of one colour on the lower half hides both.
+        let printed = |x: usize| if x < 20 { [20; 3] } else { [220; 3] };
+        let view = view(|x, y| if y < 20 { printed(x) } else { [90, 90, 200] });
+        let bare = |i: usize| Some((f32::from(u8::from(i < 20 * SIDE)), printed(i % SIDE)));
+        let bare = Bare::of((0..SIDE * SIDE).map(bare).collect());
+        let edges = Edges::new(&view.image, Some(&bare));
+        let at = |x: usize, y: usize| y * SIDE + x;
+        assert_eq!(edges.difference(at(19, 5), at(20, 5)), 0.0, "ink and paper, as printed");
+        assert_eq!(edges.difference(at(19, 30), at(20, 30)), 0.0, "the object, in front of the same edge");
+        assert!(
+            edges.difference(at(5, 19), at(5, 20)) > 1e4 && edges.difference(at(30, 19), at(30, 20)) > 1e4
+        );
+        let without = Edges::new(&view.image, None);
+        assert!(without.difference(at(19, 5), at(20, 5)) > 1e4);
+    }
+}

@@ -195,6 +195,12 @@ impl Bare {
         Bare { pixels: (0..w * h).map(pixel).collect() }
     }
 
+    /// Likelihoods and colours of all pixels.
+    #[cfg(test)]
+    pub fn of(pixels: Vec<Option<(f32, [u8; 3])>>) -> Bare {
+        Bare { pixels }
+    }
+
     /// How likely a pixel shows the bare board, relative to the most likely colour, 0 to 1; `None` outside the board.
     pub fn likelihood(&self, i: usize) -> Option<f32> {
         self.pixels[i].map(|(likelihood, _)| likelihood)
