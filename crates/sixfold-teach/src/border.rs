@@ -13,8 +13,8 @@ use sixfold_geometry::{Image, Mask, Plane, RgbImage};
 use crate::cut::Cut;
 use crate::distance::signed_distance;
 use crate::grid::Grid;
-use crate::hull::Outlined;
-use crate::silhouette::{Bare, Cues, covered, shape_centre, without_specks};
+use crate::hull::{Outlined, two_largest};
+use crate::silhouette::{Bare, Cues, bin, covered, shape_centre, without_specks};
 use crate::view::View;
 
 // All numbers chosen by hand on simulated captures of three mugs, two of which are among those of the reported numbers.
@@ -98,15 +98,9 @@ fn confirmed(views: &[Outlined<'_>], like: &Grid, floor: Option<Plane>) -> Grid 
     let mut grid = like.clone();
     grid.values.par_iter_mut().enumerate().for_each(|(i, value)| {
         let point = like.point(like.place(i));
-        let mut largest = [f32::NEG_INFINITY; 2];
-        for [_, beyond] in views.iter().filter_map(|view| view.outside(&point)) {
-            if beyond > largest[0] {
-                largest = [beyond, largest[0]];
-            } else if beyond > largest[1] {
-                largest[1] = beyond;
-            }
-        }
-        let distance = if largest[1].is_finite() { largest[1] } else { like.step as f32 };
+        let [_, second] =
+            two_largest(views.iter().filter_map(|view| view.outside(&point)).map(|[_, any]| any));
+        let distance = if second.is_finite() { second } else { like.step as f32 };
         *value = floor.map_or(distance, |floor| distance.max(-floor.distance(&point) as f32));
     });
     grid
@@ -167,20 +161,15 @@ struct Palette(Vec<f32>);
 impl Palette {
     fn of(colors: impl Iterator<Item = [u8; 3]>) -> Palette {
         let mut counts = vec![0.0f32; BINS.pow(3)];
-        colors.for_each(|color| counts[bin(color)] += 1.0);
+        colors.for_each(|color| counts[bin(color, BINS)] += 1.0);
         let smooth = smoothed(counts);
         let most = smooth.iter().copied().fold(1e-6, f32::max);
         Palette(smooth.into_iter().map(|count| (count / (TYPICAL * most)).min(1.0)).collect())
     }
 
     fn likelihood(&self, color: [u8; 3]) -> f32 {
-        self.0[bin(color)]
+        self.0[bin(color, BINS)]
     }
-}
-
-fn bin(color: [u8; 3]) -> usize {
-    let [r, g, b] = color.map(|c| usize::from(c) * BINS / 256);
-    (r * BINS + g) * BINS + b
 }
 
 /// Each bin with half of each of its neighbours, along each axis.
@@ -274,6 +263,18 @@ mod tests {
     }
 
     #[test]
+    fn what_the_other_photographs_exclude_is_left_out() {
+        let (view, rough) = (view(|_, _| [60, 70, 60]), square(5, 35));
+        let cues = Cues { salience: Image::filled(SIDE, SIDE, 3.0), ..cues(None) };
+        let right = |possible: &Mask| {
+            let found = cut(&view, &cues, &rough, &rough, Some(possible));
+            (0..SIDE * SIDE).filter(|i| i % SIDE >= 20 && found.as_slice()[*i]).count()
+        };
+        assert!(right(&rough) > 400);
+        assert_eq!(right(&Image::from_fn(SIDE, SIDE, |x, _| x < 20)), 0);
+    }
+
+    #[test]
     fn an_edge_of_the_print_is_no_edge_where_the_board_is_bare() {
         // Ink on the left, paper on the right; an object of one colour on the lower half hides both.
         let printed = |x: usize| if x < 20 { [20; 3] } else { [220; 3] };
@@ -282,7 +283,7 @@ mod tests {
         let bare = Bare::of((0..SIDE * SIDE).map(bare).collect());
         let edges = Edges::new(&view.image, Some(&bare));
         let at = |x: usize, y: usize| y * SIDE + x;
-        assert_eq!(edges.difference(at(19, 5), at(20, 5)), 0.0, "ink and paper, as printed");
+        assert_eq!(edges.difference(at(19, 5), at(20, 5)), 0.0, "ink and paper of the print");
         assert_eq!(edges.difference(at(19, 30), at(20, 30)), 0.0, "the object, in front of the same edge");
         assert!(
             edges.difference(at(5, 19), at(5, 20)) > 1e4 && edges.difference(at(30, 19), at(30, 20)) > 1e4

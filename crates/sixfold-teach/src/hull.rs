@@ -43,18 +43,19 @@ pub(crate) fn hull(views: &[Outlined<'_>], volume: &Volume, cells: usize, floor:
     Grid::new(volume, cells, |point| {
         // A point beyond the outer border of one mask is outside. A hole has to be in two masks, so that one wrong mask does not
         // make a hole.
-        let (mut outer, mut largest) = (f32::NEG_INFINITY, [f32::NEG_INFINITY; 2]);
-        for [beyond, distance] in views.iter().filter_map(|view| view.outside(point)) {
-            outer = outer.max(beyond);
-            if distance > largest[0] {
-                largest = [distance, largest[0]];
-            } else if distance > largest[1] {
-                largest[1] = distance;
-            }
-        }
+        let outside: Vec<[f32; 2]> = views.iter().filter_map(|view| view.outside(point)).collect();
+        let outer = outside.iter().map(|o| o[0]).fold(f32::NEG_INFINITY, f32::max);
+        let largest = two_largest(outside.iter().map(|o| o[1]));
         let distance = outer.max(largest[ignored]);
         let distance = if distance.is_finite() { distance } else { volume.size().max() as f32 };
         floor.map_or(distance, |floor| distance.max(-floor.distance(point) as f32))
+    })
+}
+
+/// The two largest values, largest first; minus infinity where there are fewer.
+pub(crate) fn two_largest(values: impl Iterator<Item = f32>) -> [f32; 2] {
+    values.fold([f32::NEG_INFINITY; 2], |[first, second], value| {
+        if value > first { [value, first] } else { [first, second.max(value)] }
     })
 }
 

@@ -429,9 +429,10 @@ struct Colors {
     beside: Vec<f32>,
 }
 
-fn bin(color: [u8; 3]) -> usize {
-    let [r, g, b] = color.map(|c| usize::from(c) * BINS / 256);
-    (r * BINS + g) * BINS + b
+/// The bin of a colour in a histogram with so many bins per channel.
+pub(crate) fn bin(color: [u8; 3], bins: usize) -> usize {
+    let [r, g, b] = color.map(|c| usize::from(c) * bins / 256);
+    (r * bins + g) * bins + b
 }
 
 impl Colors {
@@ -440,9 +441,9 @@ impl Colors {
         for (i, color) in image.as_slice().iter().enumerate() {
             let odds = odds.as_slice()[i];
             if shape.as_slice()[i] && odds > 0.0 {
-                colors.object[bin(*color)] += 1.0;
+                colors.object[bin(*color, BINS)] += 1.0;
             } else if !grown.as_slice()[i] || odds < -1.0 {
-                colors.beside[bin(*color)] += 1.0;
+                colors.beside[bin(*color, BINS)] += 1.0;
             }
         }
         for histogram in [&mut colors.object, &mut colors.beside] {
@@ -453,7 +454,7 @@ impl Colors {
     }
 
     fn odds(&self, color: [u8; 3]) -> f32 {
-        let bin = bin(color);
+        let bin = bin(color, BINS);
         (self.object[bin] / self.beside[bin]).ln().clamp(-MOST, MOST)
     }
 }
