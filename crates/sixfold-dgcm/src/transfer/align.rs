@@ -7,7 +7,7 @@
 
 use serde::{Deserialize, Serialize};
 use sixfold_geometry::{
-    IcpLevel, IcpOptions, IndexedCloud, OptionError, PointCloud, Pose, Vec3, icp, kabsch,
+    IcpLevel, IcpOptions, IndexedCloud, KdTree, OptionError, PointCloud, Pose, Vec3, icp, kabsch,
 };
 
 use sixfold_experience::{Crop, Extent};
@@ -94,6 +94,9 @@ pub struct Transferred {
     /// Root mean square of the point-to-plane distances after ICP, metres; `None` if the result of ICP was not used, because it had
     /// too few correspondences or moved too far.
     pub rms: Option<f64>,
+    /// Mean distance of the experience's visible surface, at this pose, to the object's, plus that of the object's to the experience's,
+    /// metres; each distance counts at most 2 cm.
+    pub misfit: f64,
     /// Size of the region here relative to that in the experience, along the experience's camera axes.
     pub scale: Vec3,
 }
@@ -144,9 +147,37 @@ pub fn transfer(
         let start = rotation.with_translation(target.centre - source.centre);
         let scale = target.half.component_div(&source.half);
         let (pose, rms) = refine(experience, &wanted, cloud, &start, options);
-        found.push(Transferred { camera_from_experience: pose, hypothesis, pixels: here.len(), rms, scale });
+        let misfit = misfit(input, cloud, experience, &pose);
+        found.push(Transferred {
+            camera_from_experience: pose,
+            hypothesis,
+            pixels: here.len(),
+            rms,
+            misfit,
+            scale,
+        });
     }
     found
+}
+
+/// Limit of the distances in [`Transferred::misfit`], metres.
+const FARTHEST: f64 = 0.02;
+/// Every how many pixels of a crop their distance is measured.
+const MEASURED: usize = 3;
+
+/// [`Transferred::misfit`] of a pose.
+fn misfit(input: &Crop, cloud: &IndexedCloud, experience: &Crop, camera_from_experience: &Pose) -> f64 {
+    let points = |crop: &Crop| -> Vec<Vec3> {
+        let all: Vec<usize> = crop.pixels().collect();
+        all.iter().step_by(MEASURED).map(|&i| crop.point(i)).collect()
+    };
+    let there = points(experience);
+    let there: Vec<Vec3> = there.iter().map(|p| camera_from_experience.transform_point(p)).collect();
+    let mean = |points: &[Vec3], tree: &KdTree| {
+        let distance = |p: &Vec3| tree.nearest(p).map_or(FARTHEST, |near| near.distance.min(FARTHEST));
+        points.iter().map(distance).sum::<f64>() / points.len().max(1) as f64
+    };
+    mean(&there, cloud.tree()) + mean(&points(input), &KdTree::new(&there))
 }
 
 pub(super) fn noc(v: &[f32; 3]) -> Vec3 {
@@ -234,5 +265,45 @@ fn refine(
             }
         }
         Err(_) => (*start, None),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use sixfold_experience::CropOptions;
+    use sixfold_geometry::{Camera, Image, Mask};
+
+    use super::*;
+
+    /// The crop of a step at 0.7 m, whose left half is 3 cm nearer; with or without its right half.
+    fn step(whole: bool) -> Crop {
+        let camera = Camera::new(575.0, 575.0, 159.5, 119.5, 320, 240).unwrap();
+        let right = if whole { 210 } else { 160 };
+        let inside = |x: usize, y: usize| (110..right).contains(&x) && (90..150).contains(&y);
+        let depth = Image::from_fn(320, 240, |x, y| {
+            let z = if x < 160 { 0.67 } else { 0.7 };
+            if inside(x, y) { z } else { 0.0 }
+        });
+        Crop::new(&depth, &camera, &Mask::from_fn(320, 240, inside), &CropOptions::compact()).unwrap()
+    }
+
+    #[test]
+    fn surfaces_that_lie_apart_or_are_missing_do_not_fit() {
+        let (whole, half) = (step(true), step(false));
+        let cloud = |crop: &Crop| {
+            let points: Vec<Vec3> = crop.pixels().map(|i| crop.point(i)).collect();
+            IndexedCloud::new(PointCloud { normals: vec![Vec3::z(); points.len()], points }).unwrap()
+        };
+        let at = |input: &Crop, experience: &Crop, z: f64| {
+            misfit(input, &cloud(input), experience, &Pose::from_translation(Vec3::z() * z))
+        };
+        let same = at(&whole, &whole, 0.0);
+        assert!(same < 0.002, "{same}");
+        let apart = at(&whole, &whole, 0.012);
+        assert!((0.018..0.026).contains(&apart), "1.2 cm in both directions: {apart}");
+        // What is missing in either counts.
+        let missing = [at(&whole, &half, 0.0), at(&half, &whole, 0.0)];
+        assert!(missing.iter().all(|m| (0.006..0.013).contains(m)), "{missing:?}");
+        assert!(at(&whole, &whole, 1.0) <= 2.0 * FARTHEST + 1e-9);
     }
 }

@@ -128,7 +128,7 @@ pub(super) struct Size {
 pub(super) enum Form {
     /// The default: all hypotheses.
     Ours,
-    /// The network's hypothesis alone; the gripper is placed where it is free.
+    /// The network's hypothesis alone; the gripper is placed where it is free, and surfaces that fit count more.
     Network,
     /// The same with the gripper at a fixed distance from the surface ([`ProposeOptions::published`]).
     Published,
@@ -291,7 +291,10 @@ impl Offline<'_> {
         let fitter = GraspFitter::new(&test.view, self.gripper, &options)?;
         let form = match self.form {
             Form::Ours => ProposeOptions::default(),
-            Form::Network => ProposeOptions { reach: None, ..ProposeOptions::published() },
+            Form::Network => {
+                let ProposeOptions { reach, fit_scale, .. } = ProposeOptions::default();
+                ProposeOptions { reach, fit_scale, ..ProposeOptions::published() }
+            }
             Form::Published => ProposeOptions::published(),
         };
         let options = ProposeOptions { only: Some(only), ..form };
