@@ -134,7 +134,7 @@ pub(crate) fn make(py: Python<'_>, method: &str, options: &Options) -> PyResult<
             let seed = options.seed;
             let made = interruptible(py, move |_| {
                 let pix2pose = weights.as_deref().map(|weights| (weights, None));
-                AutoMembers { pix2pose, depth, seed, without_views: false }.estimator()
+                AutoMembers { pix2pose, depth, seed, ..AutoMembers::default() }.estimator()
             })?;
             let mut estimator = made.map_err(|error| file_or_value(&error))?;
             estimator.budget = budget;

@@ -22,6 +22,8 @@ pub struct AutoMembers<'a> {
     /// A trained model of Pix2Pose, and the number of its object, for objects that do not give one; `None`: the weights that an
     /// object has of its own, if it has any.
     pub pix2pose: Option<(&'a Path, Option<u32>)>,
+    /// An object's own weights are preferred to the trained model.
+    pub own_weights_first: bool,
     /// Leave out the views in colour.
     pub without_views: bool,
     /// How depth images are prepared.
@@ -49,11 +51,13 @@ impl AutoMembers<'_> {
         let mut own = OwnWeights::default();
         own.options.estimate.seed = self.seed;
         own.refiner = Some(Arc::new(ViewsRefiner::shipped().map_err(EstimatorError::method)?));
-        members.push(match self.pix2pose {
-            Some((weights, object_id)) => {
-                Arc::new(own.with(Pix2PoseModel::load(weights).map_err(EstimatorError::method)?, object_id))
+        let model = self.pix2pose.map(|(file, _)| Pix2PoseModel::load(file));
+        let model = model.transpose().map_err(EstimatorError::method)?;
+        members.push(match (model, self.pix2pose) {
+            (Some(model), Some((_, object_id))) if !self.own_weights_first => {
+                Arc::new(own.with(model, object_id))
             }
-            None => Arc::new(own),
+            (others, _) => Arc::new(OwnWeights { others, ..own }),
         });
         if !self.without_views {
             let mut views = ViewsEstimator::shipped().map_err(EstimatorError::method)?;

@@ -16,7 +16,7 @@ use crate::model::Pix2PoseModel;
 /// File of an object's own weights in its folder ([`Object::file`]).
 pub const WEIGHTS_FILE: &str = "pix2pose.safetensors";
 
-/// Poses from colour of objects that have weights of their own.
+/// Poses from colour of objects that have weights of their own, and of those that another model knows.
 #[derive(Clone)]
 pub struct OwnWeights {
     /// Both passes, PnP and the alignment of the outline.
@@ -27,23 +27,25 @@ pub struct OwnWeights {
     pub icp: bool,
     /// Refines aligned poses, unless they are aligned with depth.
     pub refiner: Option<Arc<dyn PoseRefiner>>,
+    /// The model for objects without weights of their own; `None`: only objects that have some can be found.
+    pub others: Option<Pix2PoseModel>,
 }
 
 impl Default for OwnWeights {
     fn default() -> Self {
-        OwnWeights { options: AlignOptions::default(), refine: true, icp: false, refiner: None }
+        OwnWeights { options: AlignOptions::default(), refine: true, icp: false, refiner: None, others: None }
     }
 }
 
 impl OwnWeights {
     /// The dissertation's form: its two stages with its parameters, one pass, no alignment of the outline.
     pub fn published() -> OwnWeights {
-        OwnWeights { options: AlignOptions::published(), refine: false, icp: false, refiner: None }
+        OwnWeights { options: AlignOptions::published(), refine: false, ..OwnWeights::default() }
     }
 
     /// The same options with one model for all objects. `object_id` is the object's id in it, for objects that do not give one.
     pub fn with(self, model: Pix2PoseModel, object_id: Option<u32>) -> Pix2PoseEstimator {
-        let OwnWeights { options, refine, icp, refiner } = self;
+        let OwnWeights { options, refine, icp, refiner, others: _ } = self;
         Pix2PoseEstimator { model, options, refine, icp, object_id, refiner }
     }
 }
@@ -83,11 +85,16 @@ impl PoseEstimator for OwnWeights {
     }
 
     fn knows(&self, object: &Object) -> bool {
-        object.file(WEIGHTS_FILE).is_some_and(|file| file.is_file())
+        self.others.is_some() || object.file(WEIGHTS_FILE).is_some_and(|file| file.is_file())
     }
 
     fn prepare(&self, object: &Object) -> Result<Box<dyn PreparedObject>, EstimatorError> {
         let Some(file) = object.file(WEIGHTS_FILE).filter(|file| file.is_file()) else {
+            if let Some(model) = &self.others {
+                let estimator = self.clone().with(model.clone(), None);
+                let object = estimator.object(object)?;
+                return Ok(Box::new(OwnObject { estimator, object }));
+            }
             return Err(EstimatorError::Lacks {
                 object: object.name.clone(),
                 what: "weights of its own",

@@ -1,6 +1,6 @@
 // The page Objects: what is stored, a mesh that can be rotated, adding and removing.
 
-import { ask, byId, element, json, run, showProblem } from "/static/api.js";
+import { ask, byId, element, follow, json, Problem, run, showProblem } from "/static/api.js";
 
 /** More faces than that are not sent to the page. */
 const FACES = 60000;
@@ -69,6 +69,7 @@ async function open(object) {
   byId("mesh-link").hidden = !object.links.mesh;
   byId("mesh-link").href = object.links.mesh || "#";
   byId("mesh-link").download = `${object.name}.ply`;
+  showTraining(object);
   byId("viewer").hidden = byId("viewer-hint").hidden = !object.links.mesh;
   if (object.error) showProblem(byId("detail-status"), new Error(object.error));
   if (window.matchMedia("(max-width: 899px)").matches) byId("detail").scrollIntoView({ behavior: "instant" });
@@ -91,6 +92,90 @@ async function view(object) {
       element("img", { src: object.links.thumbnail, alt: "" }),
       element("p", {}, [`It cannot be rotated here: ${problem.message}`]),
     );
+  }
+}
+
+/** The trainings that this page follows: their jobs by the names of the objects. */
+const followed = new Map();
+
+function showTraining(object) {
+  byId("training").hidden = !object.has_photographs;
+  const running = followed.has(object.name);
+  byId("training-hint").textContent = object.has_weights
+    ? "A network of its own finds it in colour images (method pix2pose, and a part of auto)."
+    : "It was taught from photographs. A network trained on new views of them finds it in colour images, partly occluded too. That takes a quarter of an hour or more; it continues if this page is closed.";
+  byId("train").textContent = object.has_weights ? "Train again" : "Train a network";
+  byId("train").hidden = running;
+  byId("train-cancel").hidden = byId("train-bar").hidden = !running;
+  byId("train-status").replaceChildren();
+  if (running) showStep(followed.get(object.name));
+}
+
+function showStep(job) {
+  const { step, done, total } = job.progress;
+  byId("train-bar").max = total || 1;
+  byId("train-bar").value = done;
+  byId("train-status").textContent = job.state === "queued" ? "Waiting for another training ..." : `${step} (${done} of ${total})`;
+}
+
+/** Shows the progress of a training while its object is the open one, until it ends. */
+async function followTraining(name, job) {
+  const open = () => shown === name;
+  followed.set(name, job);
+  if (open()) showTraining(await json(`/v1/objects/${encodeURIComponent(name)}`));
+  try {
+    const ended = await follow(job, (now) => {
+      followed.set(name, now);
+      if (open()) showStep(now);
+    });
+    followed.delete(name);
+    const object = (await list()).find((o) => o.name === name);
+    if (open() && object) {
+      mark(name);
+      byId("facts").replaceChildren(...(object.error ? [] : facts(object)));
+      showTraining(object);
+    }
+    if (ended.state === "cancelled") throw new Problem({ error: "Cancelled. The next training of this object resumes where it stopped." }, 409);
+    if (ended.state === "failed") throw new Problem(ended.error || {}, 422);
+    if (open()) byId("train-status").replaceChildren(element("span", { className: "good" }, ["The network is trained and stored."]));
+  } catch (problem) {
+    followed.delete(name);
+    if (open()) {
+      byId("train").hidden = false;
+      byId("train-cancel").hidden = byId("train-bar").hidden = true;
+      showProblem(byId("train-status"), problem);
+    }
+  }
+}
+
+byId("train").addEventListener("click", async () => {
+  const name = shown;
+  try {
+    const object = await json(`/v1/objects/${encodeURIComponent(name)}`);
+    if (object.has_weights && !confirm(`Replace the network of ${name}?`)) return;
+    const body = JSON.stringify({ replace: object.has_weights });
+    const job = await json(`/v1/objects/${encodeURIComponent(name)}/training`, { method: "POST", body });
+    await followTraining(name, job);
+  } catch (problem) {
+    showProblem(byId("train-status"), problem);
+  }
+});
+
+byId("train-cancel").addEventListener("click", async () => {
+  const job = followed.get(shown);
+  if (!job) return;
+  try {
+    await ask(`${job.links.job}/cancel`, { method: "POST" });
+  } catch (problem) {
+    showProblem(byId("train-status"), problem);
+  }
+});
+
+/** Follows the trainings that were started before this page was opened. */
+async function resumeTrainings() {
+  const { jobs } = await json("/v1/jobs");
+  for (const job of jobs) {
+    if (job.kind === "train" && ["queued", "running"].includes(job.state)) followTraining(job.object, job);
   }
 }
 
@@ -141,4 +226,6 @@ byId("add").addEventListener("submit", async (event) => {
   }
 });
 
-list().catch((problem) => showProblem(byId("cards"), problem));
+list()
+  .then(resumeTrainings)
+  .catch((problem) => showProblem(byId("cards"), problem));

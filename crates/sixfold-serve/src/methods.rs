@@ -14,6 +14,7 @@ use sixfold_ppf::PpfEstimator;
 use utoipa::ToSchema;
 
 use crate::error::{Answer, ApiError, ServeError};
+use crate::objects::WEIGHTS;
 
 /// Maximum number of prepared objects kept; the least recently used are removed. Each takes a few to some ten MB.
 const MAX_KEPT: usize = 64;
@@ -62,15 +63,15 @@ impl Method {
     }
 }
 
-/// The state of a stored object from which data was derived; it changes when the object is replaced.
+/// The state of a stored object from which data was derived; it changes when the object is replaced or a network is trained for it.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(crate) struct Stamp(Option<SystemTime>, u64);
+pub(crate) struct Stamp([Option<SystemTime>; 2], u64);
 
 impl Stamp {
     /// The state of the object as stored now; the store has accepted its name before.
     fn of(store_folder: &std::path::Path, name: &str, record: &str) -> Stamp {
-        let metadata = std::fs::metadata(store_folder.join(name).join("object.json"));
-        Stamp(metadata.and_then(|m| m.modified()).ok(), sixfold_io::fnv1a(record.as_bytes()))
+        let changed = |file| std::fs::metadata(store_folder.join(name).join(file)).and_then(|m| m.modified());
+        Stamp(["object.json", WEIGHTS].map(|file| changed(file).ok()), sixfold_io::fnv1a(record.as_bytes()))
     }
 }
 
@@ -274,13 +275,15 @@ mod with_networks {
     use super::*;
     use sixfold_auto::AutoMembers;
     use sixfold_detect::detector::TrainedDetector;
-    use sixfold_pix2pose::estimator::Pix2PoseEstimator;
+    use sixfold_pix2pose::model::Pix2PoseModel;
+    use sixfold_pix2pose::own_weights::OwnWeights;
     use sixfold_views::ViewsRefiner;
     use sixfold_views::estimator::ViewsEstimator;
 
-    pub const ADVICE: &str = "pix2pose needs a trained model: start the server with --pix2pose FILE.safetensors; else choose one of them";
+    pub const ADVICE: &str = "choose one of them";
 
-    /// The methods that need a network. A model that cannot be read is an error at the start, not at the first request.
+    /// The methods that need a network. A model that cannot be read is an error at the start, not at the first request. Pix2Pose finds
+    /// the objects that have weights of their own and, with a model, those that this was trained on.
     pub fn methods(pix2pose: Option<PathBuf>) -> Result<Vec<Method>, ServeError> {
         let views = || {
             let views = ViewsEstimator::shipped().map_err(EstimatorError::method)?;
@@ -290,25 +293,30 @@ mod with_networks {
         let of_auto = pix2pose.clone();
         let auto = move || {
             let pix2pose = of_auto.as_deref().map(|file| (file, None));
-            Ok(Arc::new(AutoMembers { pix2pose, ..AutoMembers::default() }.estimator()?) as Estimator)
+            let members = AutoMembers { pix2pose, own_weights_first: true, ..AutoMembers::default() };
+            Ok(Arc::new(members.estimator()?) as Estimator)
         };
-        let mut methods = vec![
+        let given = pix2pose.is_some();
+        let trained = move || {
+            let model = pix2pose.as_deref().map(Pix2PoseModel::load).transpose();
+            let refiner = ViewsRefiner::shipped().map_err(EstimatorError::method)?;
+            let own = OwnWeights {
+                others: model.map_err(EstimatorError::method)?,
+                refiner: Some(Arc::new(refiner)),
+                ..OwnWeights::default()
+            };
+            Ok(Arc::new(own) as Estimator)
+        };
+        let trained = Method::new("pix2pose", "object coordinates by a trained network, in boxes", trained);
+        if given {
+            let fault = |e| ServeError::Method(anyhow::Error::new(e).context("--pix2pose"));
+            trained.estimator().map_err(fault)?;
+        }
+        Ok(vec![
             Method::new("auto", "all methods, their poses judged together, with probabilities", auto),
             Method::new("views", "rendered views matched with a colour image, no training", views),
-        ];
-        if let Some(file) = pix2pose {
-            let build = move || {
-                let trained = Pix2PoseEstimator::load(&file).map_err(EstimatorError::method)?;
-                let refiner = ViewsRefiner::shipped().map_err(EstimatorError::method)?;
-                Ok(Arc::new(trained.with_refiner(Arc::new(refiner))) as Estimator)
-            };
-            let method = Method::new("pix2pose", "object coordinates by a trained network, in boxes", build);
-            method
-                .estimator()
-                .map_err(|e| ServeError::Method(anyhow::Error::new(e).context("--pix2pose")))?;
-            methods.push(method);
-        }
-        Ok(methods)
+            trained,
+        ])
     }
 }
 
@@ -337,7 +345,7 @@ mod tests {
 
     #[test]
     fn the_least_recently_used_are_removed_and_replaced_ones_do_not_count() {
-        let stamp = |n| Stamp(None, n);
+        let stamp = |n| Stamp([None; 2], n);
         let mut recent = Recent::new();
         for i in 0..MAX_KEPT as u32 {
             recent.put(i, stamp(0), i);

@@ -30,6 +30,10 @@ const GROUND: [u8; 3] = [244, 245, 247];
 const FILLED: f64 = 0.86;
 /// Maximum number of thumbnails kept, some 30 kB each.
 const MAX_THUMBNAILS: usize = 500;
+/// The file that lists an object's photographs, and that of its own network's weights, in its folder. They are the constants of crates
+/// that a program without networks does not have.
+const PHOTOGRAPHS: &str = "photographs/photographs.json";
+pub(crate) const WEIGHTS: &str = "pix2pose.safetensors";
 /// Minimum number of faces that a mesh is reduced to.
 const MIN_FACES: usize = 100;
 
@@ -52,6 +56,10 @@ pub(crate) struct ObjectView {
     /// The file that it was added from, and its unit.
     source: String,
     source_unit: Option<String>,
+    /// Whether its photographs are stored, on which a network can be trained for it.
+    has_photographs: bool,
+    /// Whether a network was trained for it: the method pix2pose finds it without a trained model of the server.
+    has_weights: bool,
     /// What its folder holds: files and their bytes.
     files: Vec<ObjectFile>,
     /// Why its record cannot be read; the other fields are then invalid.
@@ -103,6 +111,8 @@ impl ObjectView {
             symmetries_continuous: record.map_or(0, |r| r.symmetries_continuous.len()),
             source: record.map_or_else(String::new, |r| file_name(&r.source)),
             source_unit: record.map(|r| r.source_unit.to_string()),
+            has_photographs: app.options.objects.join(name).join(PHOTOGRAPHS).is_file(),
+            has_weights: app.options.objects.join(name).join(WEIGHTS).is_file(),
             files: files(app, name),
             error,
             links: ObjectLinks {

@@ -57,6 +57,7 @@ struct Description;
 #[derive(OpenApi)]
 #[openapi(
     paths(
+        tasks::train::train_object,
         teachings::list_teachings,
         teachings::add_teaching,
         teachings::get_teaching,

@@ -37,7 +37,7 @@ pub struct ServerOptions {
     pub max_connections: usize,
     /// Longest time for one request to arrive and be answered; events of a job are sent as long as it runs.
     pub request_timeout: Duration,
-    /// Longest time for a job; a longer one is stopped between two objects.
+    /// Longest time for a job; a longer one is stopped between two objects. Trainings have no limit.
     pub job_timeout: Duration,
 }
 

@@ -168,6 +168,7 @@ fn teaching_routes() -> Router<Arc<App>> {
         .route("/left_out", put(t::set_left_out))
         .route("/corrections", delete(t::forget_corrections));
     Router::new()
+        .route("/v1/objects/{name}/training", post(tasks::train::train_object))
         .route("/v1/teachings", get(t::list_teachings).post(t::add_teaching))
         .route("/v1/teachings/{id}", get(t::get_teaching).delete(t::delete_teaching))
         .route("/v1/teachings/{id}/photographs", post(t::add_photographs))

@@ -3,15 +3,13 @@
 
 use std::collections::BTreeSet;
 use std::path::Path;
-use std::sync::Mutex;
-use std::sync::atomic::Ordering;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Instant;
 
 use anyhow::{Context, Result, anyhow, bail};
 use serde::Serialize;
 use sixfold_bop::write_camera;
 use sixfold_data::{RoughImages, RoughObject};
-use sixfold_geometry::Progress as _;
 use sixfold_geometry::stats::upper_median;
 use sixfold_nol::agreement::leave_out_what_differs;
 use sixfold_nol::pose_file::PoseFile;
@@ -24,7 +22,7 @@ use sixfold_synth::augment::{Backgrounds, PhotographOptions};
 
 use crate::folder::{Contents, DatasetFolder};
 use crate::pictures::Pictures;
-use crate::progress::{Bar, Progress, interrupted};
+use crate::progress::Watch;
 use crate::sheets::write_sheet;
 
 /// Side of the crops that provide the colours of new views, pixels.
@@ -136,25 +134,48 @@ pub fn add_contents(contents: &mut Contents, images: &RoughImages) {
     }
 }
 
+/// Counts the views of all objects.
+struct Views<'a> {
+    watch: &'a dyn Watch,
+    done: AtomicUsize,
+    all: usize,
+}
+
+impl Views<'_> {
+    /// One more view of an object is done; whether to go on.
+    fn next(&self, object: u32) -> bool {
+        let done = self.done.fetch_add(1, Ordering::Relaxed) + 1;
+        self.watch.report("views", done, self.all, format!("object {object}"));
+        !self.watch.stop().load(Ordering::Relaxed)
+    }
+}
+
 impl NewViews<'_> {
     /// Makes the views of all objects in `folder`, or those that are not there yet. Images for people that could not be written are
     /// in the second value.
     ///
     /// # Errors
-    /// For photographs that cannot be used, a folder that cannot be written, and when the user interrupts.
-    pub fn make(&self, folder: &DatasetFolder, mut images: RoughImages) -> Result<(ViewsSummary, Pictures)> {
+    /// For photographs that cannot be used, a folder that cannot be written, and when `watch` stops it.
+    pub fn make(
+        &self,
+        folder: &DatasetFolder,
+        mut images: RoughImages,
+        watch: &dyn Watch,
+    ) -> Result<(ViewsSummary, Pictures)> {
         let start = Instant::now();
         for object in &mut images.objects {
             match self.chosen_by {
                 ChosenBy::Surface => {
-                    choose_images(object, self.sources)?.iter().for_each(|note| eprintln!("note: {note}"));
+                    for note in choose_images(object, self.sources)? {
+                        watch.note(&format!("note: {note}"));
+                    }
                 }
                 ChosenBy::Pose(seed) => choose_images_by_pose(object, self.sources, seed),
             }
         }
         let counts: Vec<usize> = images.objects.iter().map(|o| o.images.len()).collect();
         let mut sheets = Pictures::default();
-        let poses = self.refined_poses(folder.path(), &mut images, &mut sheets)?;
+        let poses = self.refined_poses(folder.path(), &mut images, &mut sheets, watch)?;
         folder.write_models(images.objects.iter().map(|o| (o.id, &o.mesh, &o.info)))?;
         let backgrounds = match self.backgrounds {
             Some(folder) => Backgrounds::from_folder(folder, &PhotographOptions::default())?,
@@ -167,19 +188,22 @@ impl NewViews<'_> {
             backgrounds: &backgrounds,
             with_photographs: self.with_photographs,
         };
-        let mut progress = Progress::new("views", self.grid.count() * images.objects.len());
+        let progress =
+            Views { watch, done: AtomicUsize::new(0), all: self.grid.count() * images.objects.len() };
         let (mut rows, mut objects, mut first_camera) = (vec![], vec![], None);
         for (object, count) in images.objects.iter().zip(&counts) {
             if object.images.is_empty() {
-                eprintln!("note: object {}: none of its photographs can be used; left out", object.id);
+                watch.note(&format!(
+                    "note: object {}: none of its photographs can be used; left out",
+                    object.id
+                ));
                 continue;
             }
-            let (summary, written) = self.of_object(&split, object, *count, &poses, &mut progress)?;
+            let (summary, written) = self.of_object(&split, object, *count, &poses, &progress)?;
             objects.push(summary);
             rows.push(written.preview);
             first_camera = first_camera.or(written.camera);
         }
-        progress.finish();
         sheets.did(write_sheet(&folder.path().join("preview.png"), &rows));
         // BOP has one such file per dataset, for tools that need any camera: it holds that of the first image. Each image's own
         // intrinsics are in scene_camera.json.
@@ -200,9 +224,14 @@ impl NewViews<'_> {
     }
 
     /// Refines the poses, draws them, and replaces the given ones.
-    fn refined_poses(&self, out: &Path, images: &mut RoughImages, sheets: &mut Pictures) -> Result<PoseFile> {
+    fn refined_poses(
+        &self,
+        out: &Path,
+        images: &mut RoughImages,
+        sheets: &mut Pictures,
+        watch: &dyn Watch,
+    ) -> Result<PoseFile> {
         let file = out.join("poses.json");
-        let bar = Bar::stopped_by_interrupts("poses, per cent");
         let ours = match &self.refinement {
             Refinement::Ours(options) => Some(options),
             Refinement::Given | Refinement::Published => None,
@@ -212,13 +241,13 @@ impl NewViews<'_> {
             Some(PoseFile::refined_as_published(images, network, self.disturbed, &file)?)
         } else {
             PoseFile::refined(images, ours, self.disturbed, &file, &|done, total| {
-                bar.report(100 * done / total, 100)
+                watch.report("poses, per cent", 100 * done / total, 100, String::new());
+                !watch.stop().load(Ordering::Relaxed)
             })?
         };
-        bar.finish();
         let Some(poses) = poses else { bail!("interrupted; give the same command again") };
         sheets.did(write_sheet(&out.join("poses.png"), &poses.outlines(images, &file)?));
-        poses.apply(images, &file)?.iter().for_each(|note| eprintln!("note: {note}"));
+        poses.apply(images, &file)?.iter().for_each(|note| watch.note(&format!("note: {note}")));
         Ok(poses)
     }
 
@@ -229,7 +258,7 @@ impl NewViews<'_> {
         object: &RoughObject,
         count: usize,
         poses: &PoseFile,
-        progress: &mut Progress,
+        progress: &Views<'_>,
     ) -> Result<(ObjectViews, WrittenViews)> {
         let mut sources: Vec<SourceView> = object
             .images
@@ -239,13 +268,7 @@ impl NewViews<'_> {
         let differing = leave_out_what_differs(&mut sources, &object.mesh);
         let maker = ViewMaker::new(&object.mesh, sources, self.weighting, self.per_view)
             .with_context(|| format!("object {}", object.id))?;
-        let (stop, progress) = (interrupted(), Mutex::new(progress));
-        let written = split.write(object, &maker, &|_, _| {
-            if let Ok(mut progress) = progress.lock() {
-                progress.step(format!("object {}", object.id));
-            }
-            !stop.load(Ordering::Relaxed)
-        })?;
+        let written = split.write(object, &maker, &|_, _| progress.next(object.id))?;
         let written =
             written.ok_or_else(|| anyhow!("interrupted; give the same command again to continue"))?;
         let of_object = || poses.photographs.iter().filter(|p| p.object == object.id);

@@ -22,6 +22,7 @@ use sixfold_teach::photographs_of;
 
 use crate::folder::{Contents, DatasetFolder};
 use crate::new_views::{ChosenBy, NewViews, Refinement, add_contents};
+use crate::progress::Watch;
 use crate::training::train_pix2pose;
 
 /// Default number of training steps.
@@ -99,8 +100,8 @@ impl ObjectTraining<'_> {
     /// is done for an object that has these weights.
     ///
     /// # Errors
-    /// For an object that is not stored or has no photographs, weights of another training, and when the user interrupts.
-    pub fn run(&self) -> Result<TrainedObject> {
+    /// For an object that is not stored or has no photographs, weights of another training, and when `watch` stops it.
+    pub fn run(&self, watch: &dyn Watch) -> Result<TrainedObject> {
         let name = self.name;
         let object = self.store.load(name).map_err(|error| match error {
             StoreError::Unknown { folder, there, .. } => anyhow!(
@@ -123,7 +124,7 @@ impl ObjectTraining<'_> {
         let out = self.out.join(format!("training-{:08x}", contents.value() as u32));
         let start = Instant::now();
         let views = out.join(format!("views-{}", self.view_step));
-        self.make_views(&views, images, &contents)?;
+        self.make_views(&views, images, &contents, watch)?;
         let made = start.elapsed().as_secs_f64();
         let start = Instant::now();
         let (material, [synthesized, photographs]) = material(name, &views, self.grid().count())?;
@@ -139,7 +140,7 @@ impl ObjectTraining<'_> {
             ..Pix2PoseRecipe::default()
         };
         let out = out.join(format!("pix2pose-{}-{}", self.view_step, self.steps));
-        let trained = train_pix2pose(&recipe, material, &out, false, by_flag)?;
+        let trained = train_pix2pose(&recipe, material, &out, false, watch, by_flag)?;
         let weights = self.keep(&object, &trained.model, &on)?;
         let seconds = Some(Seconds { views: made, training: start.elapsed().as_secs_f64() });
         Ok(TrainedObject { weights, steps: trained.steps, on, seconds })
@@ -171,7 +172,13 @@ impl ObjectTraining<'_> {
     }
 
     /// Makes the views that are not there yet. The poses are those of the record: the mesh was made with them.
-    fn make_views(&self, views: &Path, images: RoughImages, contents: &Contents) -> Result<()> {
+    fn make_views(
+        &self,
+        views: &Path,
+        images: RoughImages,
+        contents: &Contents,
+        watch: &dyn Watch,
+    ) -> Result<()> {
         let options = json!({
             "version": env!("CARGO_PKG_VERSION"), "step": self.view_step, "elevation": ELEVATION, "size": SIDE,
             "sources": SOURCES, "per_view": PER_VIEW,
@@ -191,8 +198,8 @@ impl ObjectTraining<'_> {
             backgrounds: None,
             with_photographs: true,
         };
-        let (summary, mut sheets) = new.make(&folder, images)?;
-        sheets.take_failed().iter().for_each(|text| eprintln!("skipped {text}"));
+        let (summary, mut sheets) = new.make(&folder, images, watch)?;
+        sheets.take_failed().iter().for_each(|text| watch.note(&format!("skipped {text}")));
         if summary.objects.is_empty() {
             bail!("object {}: none of its photographs can be used", self.name);
         }

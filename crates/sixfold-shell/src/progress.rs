@@ -134,3 +134,64 @@ impl sixfold_geometry::Progress for Bar {
         self.stop.is_none_or(|stop| !stop.load(Ordering::Relaxed))
     }
 }
+
+/// Receives the progress of a long run of several activities, and can stop it.
+pub trait Watch: Sync {
+    /// `done` of `total` parts of an activity are done.
+    fn report(&self, activity: &'static str, done: usize, total: usize, message: String);
+
+    /// A note for people.
+    fn note(&self, text: &str);
+
+    /// Set once the run is to stop after its current step.
+    fn stop(&self) -> &AtomicBool;
+}
+
+/// Progress bars on standard error, one after the other; an interrupt stops the run.
+#[derive(Default)]
+pub struct Terminal {
+    bar: Mutex<Option<(&'static str, Progress)>>,
+}
+
+impl Terminal {
+    /// Removes the bar.
+    fn clear(&self) {
+        if let Ok(mut shown) = self.bar.lock()
+            && let Some((_, bar)) = shown.take()
+        {
+            bar.finish();
+        }
+    }
+}
+
+impl Watch for Terminal {
+    fn report(&self, activity: &'static str, done: usize, total: usize, message: String) {
+        let Ok(mut shown) = self.bar.lock() else { return };
+        if shown.as_ref().is_none_or(|(before, _)| *before != activity)
+            && let Some((_, before)) = shown.replace((activity, Progress::new(activity, total)))
+        {
+            before.finish();
+        }
+        if let Some((_, bar)) = &mut *shown {
+            bar.set(done);
+            if !message.is_empty() {
+                bar.message(message);
+            }
+        }
+    }
+
+    fn note(&self, text: &str) {
+        self.clear();
+        eprintln!("{text}");
+    }
+
+    fn stop(&self) -> &AtomicBool {
+        interrupted()
+    }
+}
+
+impl Drop for Terminal {
+    fn drop(&mut self) {
+        self.clear();
+    }
+}

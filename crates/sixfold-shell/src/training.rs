@@ -18,7 +18,7 @@ use sixfold_pix2pose::recipe::Pix2PoseRecipe;
 
 use crate::datasets;
 use crate::objects;
-use crate::progress::{Progress, interrupted};
+use crate::progress::{Terminal, Watch};
 use crate::ranges::folder_name;
 
 /// What a training learns from.
@@ -157,8 +157,8 @@ pub struct Shown {
     pub message: fn(&TrainingRecord) -> String,
 }
 
-/// Trains in `out`, or resumes the training there, or only writes the model of its last checkpoint. `by_flag` describes an option
-/// out of its range by the name of its flag.
+/// Trains in `out`, or resumes the training there, or only writes the model of its last checkpoint, with progress on the terminal.
+/// `by_flag` describes an option out of its range by the name of its flag.
 ///
 /// # Errors
 /// As the recipe, and when the user interrupts.
@@ -170,12 +170,21 @@ pub fn train_in<R: Recipe>(
     shown: Shown,
     by_flag: impl Fn(&OptionError) -> anyhow::Error,
 ) -> Result<Trained<R::Report>> {
-    let mut bars = Bars { shown, bar: None };
-    let mut receive = |event: TrainingEvent<'_>| bars.receive(event);
-    let mut session = Session::new(out, interrupted(), &mut receive);
+    train_watched(recipe, data, out, export_only, &Events { shown, watch: &Terminal::default() }, by_flag)
+}
+
+fn train_watched<R: Recipe>(
+    recipe: &R,
+    data: R::Data,
+    out: &Path,
+    export_only: bool,
+    events: &Events<'_>,
+    by_flag: impl Fn(&OptionError) -> anyhow::Error,
+) -> Result<Trained<R::Report>> {
+    let mut receive = |event: TrainingEvent<'_>| events.receive(event);
+    let mut session = Session::new(out, events.watch.stop(), &mut receive);
     let ended =
         if export_only { export(recipe, data, &mut session) } else { train(recipe, data, &mut session) };
-    bars.finish();
     match ended {
         Ok(Outcome::Finished(trained)) => Ok(trained),
         Ok(Outcome::Interrupted { step: 0 }) => {
@@ -189,7 +198,8 @@ pub fn train_in<R: Recipe>(
     }
 }
 
-/// Trains Pix2Pose in `out`, or resumes the training there, or only writes the model of its last checkpoint; as [`train_in`].
+/// Trains Pix2Pose in `out`, or resumes the training there, or only writes the model of its last checkpoint; as [`train_in`], with
+/// progress reported to `watch`.
 ///
 /// # Errors
 /// As [`train_in`].
@@ -198,6 +208,7 @@ pub fn train_pix2pose(
     material: TrainingSet,
     out: &Path,
     export_only: bool,
+    watch: &dyn Watch,
     by_flag: impl Fn(&OptionError) -> anyhow::Error,
 ) -> Result<Trained<()>> {
     let shown = Shown {
@@ -207,44 +218,26 @@ pub fn train_pix2pose(
             format!("L1 {:.4}, {:.0} images/s", loss(record, "coordinates"), record.samples_per_second)
         },
     };
-    train_in(recipe, material, out, export_only, shown, by_flag)
+    train_watched(recipe, material, out, export_only, &Events { shown, watch }, by_flag)
 }
 
-/// A progress bar of the current activity, and notes.
-struct Bars {
+/// Passes the events of a training to those who watch it.
+struct Events<'a> {
     shown: Shown,
-    bar: Option<(&'static str, Progress)>,
+    watch: &'a dyn Watch,
 }
 
-impl Bars {
-    fn receive(&mut self, event: TrainingEvent<'_>) {
+impl Events<'_> {
+    fn receive(&self, event: TrainingEvent<'_>) {
+        let Events { shown, watch } = self;
         match event {
-            TrainingEvent::Note(text) => {
-                self.finish();
-                eprintln!("{text}");
-            }
-            TrainingEvent::Warning(text) => eprintln!("warning: {text}"),
-            TrainingEvent::Preparing(done, all) => self.bar(self.shown.preparing, all).set(done),
+            TrainingEvent::Note(text) => watch.note(text),
+            TrainingEvent::Warning(text) => watch.note(&format!("warning: {text}")),
+            TrainingEvent::Preparing(done, all) => watch.report(shown.preparing, done, all, String::new()),
             TrainingEvent::Steps(record, steps) => {
-                let message = (self.shown.message)(record);
-                let bar = self.bar("steps", steps as usize);
-                bar.set(record.step as usize);
-                bar.message(message);
+                watch.report("steps", record.step as usize, steps as usize, (shown.message)(record));
             }
-            TrainingEvent::Measuring(done, all) => self.bar(self.shown.measuring, all).set(done),
-        }
-    }
-
-    fn bar(&mut self, what: &'static str, all: usize) -> &mut Progress {
-        if self.bar.as_ref().is_some_and(|(before, _)| *before != what) {
-            self.finish();
-        }
-        &mut self.bar.get_or_insert_with(|| (what, Progress::new(what, all))).1
-    }
-
-    fn finish(&mut self) {
-        if let Some((_, bar)) = self.bar.take() {
-            bar.finish();
+            TrainingEvent::Measuring(done, all) => watch.report(shown.measuring, done, all, String::new()),
         }
     }
 }

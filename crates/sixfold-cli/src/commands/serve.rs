@@ -50,10 +50,11 @@ mod built_in {
         /// Folder of jobs, with their uploaded files and results
         #[arg(long, value_name = "DIR", default_value = "sixfold-data")]
         pub data: PathBuf,
-        /// Number of jobs that run at the same time; each uses all --threads
+        /// Number of jobs that run at the same time, besides one training; each uses all --threads
         #[arg(long, value_name = "N", default_value = "1", value_parser = count::<64>)]
         pub workers: NonZeroUsize,
-        /// Trained model that `sixfold train pix2pose` wrote: offers the method pix2pose
+        /// Trained model that `sixfold train pix2pose` wrote, for the method pix2pose (default: only the weights that objects have of
+        /// their own)
         #[arg(long, value_name = "FILE.safetensors")]
         pub pix2pose: Option<PathBuf>,
         /// Maximum size of a request, megabytes

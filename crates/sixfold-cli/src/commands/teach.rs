@@ -14,7 +14,7 @@ use sixfold_shell::Outcome;
 use sixfold_shell::board::Ends;
 use sixfold_shell::object_training::{ObjectTraining, STEPS, TrainedObject, VIEW_STEP};
 use sixfold_shell::output::{JsonArguments, report};
-use sixfold_shell::progress::Bar;
+use sixfold_shell::progress::{Bar, Terminal};
 use sixfold_shell::ranges::{self, count};
 use sixfold_shell::symmetries::described;
 use sixfold_shell::teachings::{LeftOut, TeachingFiles};
@@ -145,7 +145,7 @@ pub(crate) fn run(a: &TeachArguments) -> Result<Outcome> {
         replace: a.replace,
         out: &out,
     };
-    let trained = a.train.then(|| training.run()).transpose()?;
+    let trained = a.train.then(|| training.run(&Terminal::default())).transpose()?;
     let record = record.map_or_else(|| store.record(&a.name), Ok)?;
     let answer = Answer { name: &a.name, record, taught, trained };
     report(&a.json, &answer, || print(&answer))?;

@@ -31,6 +31,8 @@ pub(crate) struct JobView {
     /// Its id.
     id: String,
     kind: JobKind,
+    /// The object that is trained, for trainings.
+    object: Option<String>,
     state: JobState,
     progress: Progress,
     /// Number of jobs ahead of this one, while it waits.
@@ -69,6 +71,7 @@ impl JobView {
         let path = format!("/v1/jobs/{}", record.id);
         JobView {
             kind: record.kind,
+            object: record.object,
             state: record.state,
             progress: record.progress,
             ahead,

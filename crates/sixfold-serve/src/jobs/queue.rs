@@ -1,4 +1,5 @@
-//! The queue of jobs and its workers: the oldest waiting job first, one at a time for each worker.
+//! The queue of jobs and its workers: the oldest waiting job first, one at a time for each worker. Trainings take an hour, so they have
+//! a worker of their own and the other jobs do not wait for them.
 
 use std::collections::{BTreeMap, HashMap};
 use std::panic::AssertUnwindSafe;
@@ -35,6 +36,19 @@ pub(crate) struct Jobs {
     _lock: WriteLock,
 }
 
+/// Which workers process a job.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Workers {
+    Trainings,
+    Others,
+}
+
+impl Workers {
+    fn of(job: &Job) -> Workers {
+        if job.kind() == JobKind::Train { Workers::Trainings } else { Workers::Others }
+    }
+}
+
 #[derive(Default)]
 struct State {
     /// The key contains the id besides the number, because unreadable records have no number.
@@ -57,6 +71,11 @@ impl State {
 
     fn waiting(&self) -> impl Iterator<Item = &Arc<Job>> {
         self.by_number.values().filter(|job| job.state() == JobState::Queued)
+    }
+
+    /// The jobs that wait for workers of one kind.
+    fn waiting_for(&self, workers: Workers) -> impl Iterator<Item = &Arc<Job>> {
+        self.waiting().filter(move |job| Workers::of(job) == workers)
     }
 }
 
@@ -96,7 +115,13 @@ impl Jobs {
 
     /// Stores a job: its request and the uploaded files, under the server's names. It is on the disk when this
     /// returns.
-    pub fn add(&self, kind: JobKind, request: &[u8], files: &[(&str, &[u8])]) -> Answer<Arc<Job>> {
+    /// `object`: the one that is trained.
+    pub fn add(
+        &self,
+        (kind, object): (JobKind, Option<&str>),
+        request: &[u8],
+        files: &[(&str, &[u8])],
+    ) -> Answer<Arc<Job>> {
         if self.ends.load(Ordering::SeqCst) {
             return Err(ApiError::plain(
                 StatusCode::SERVICE_UNAVAILABLE,
@@ -113,7 +138,8 @@ impl Jobs {
                 write_atomically(&staged.join(name), bytes)?;
             }
             let mut state = self.state();
-            let record = JobRecord::new(id.clone(), state.last_number + 1, kind);
+            let new = JobRecord::new(id.clone(), state.last_number + 1, kind);
+            let record = JobRecord { object: object.map(str::to_owned), ..new };
             record.write(&staged)?;
             std::fs::rename(&staged, &place)?;
             sync_folder_of(&place)?;
@@ -125,7 +151,7 @@ impl Jobs {
             let _ = std::fs::remove_dir_all(&staged);
             ApiError::system("the job cannot be kept", e)
         })?;
-        self.changed.notify_one();
+        self.changed.notify_all();
         self.forget_old();
         Ok(job)
     }
@@ -189,11 +215,21 @@ impl Jobs {
         self.state().by_number.values().rev().cloned().collect()
     }
 
+    /// Whether a training of an object waits or runs.
+    #[cfg(feature = "networks")]
+    pub fn trains(&self, object: &str) -> bool {
+        let of_object = |job: &Arc<Job>| {
+            let record = job.record.borrow();
+            record.object.as_deref() == Some(object) && !record.state.is_final()
+        };
+        self.state().by_number.values().any(of_object)
+    }
+
     /// Number of jobs ahead of this one, if it waits.
     pub fn ahead(&self, job: &Job) -> Option<usize> {
         let state = self.state();
         (job.state() == JobState::Queued)
-            .then(|| state.waiting().take_while(|j| j.number < job.number).count())
+            .then(|| state.waiting_for(Workers::of(job)).take_while(|j| j.number < job.number).count())
     }
 
     /// Cancels a job: immediately if it waits, at its next step if it runs; a finished job does not change.
@@ -213,17 +249,18 @@ impl Jobs {
         Ok(job)
     }
 
-    /// Starts workers, which run until [`Jobs::end`].
+    /// Starts workers, and one for trainings, which run until [`Jobs::end`].
     pub fn start(self: &Arc<Jobs>, workers: usize, run: Arc<Run>) -> Vec<JoinHandle<()>> {
-        let worker = |_| {
+        let worker = |of: Workers| {
             let (jobs, run) = (self.clone(), run.clone());
             std::thread::spawn(move || {
-                while let Some(job) = jobs.next() {
+                while let Some(job) = jobs.next(of) {
                     jobs.work_on(&job, run.as_ref());
                 }
             })
         };
-        (0..workers).map(worker).collect()
+        let others = std::iter::repeat_n(Workers::Others, workers);
+        others.chain([Workers::Trainings]).map(worker).collect()
     }
 
     /// Asks the workers to end after their current step.
@@ -239,14 +276,14 @@ impl Jobs {
         self.ends.load(Ordering::SeqCst)
     }
 
-    /// The next job, marked as running; `None` when the server ends.
-    fn next(&self) -> Option<Arc<Job>> {
+    /// The next job for workers of this kind, marked as running; `None` when the server ends.
+    fn next(&self, workers: Workers) -> Option<Arc<Job>> {
         let mut state = self.state();
         loop {
             if self.ends.load(Ordering::SeqCst) {
                 return None;
             }
-            let first = state.waiting().next().cloned();
+            let first = state.waiting_for(workers).next().cloned();
             if let Some(job) = first {
                 // If the disk is full the job runs nevertheless, and the error is reported with the result.
                 let _ = job.change(|record| {
@@ -265,7 +302,7 @@ impl Jobs {
             job,
             server_ends: &self.ends,
             began: Instant::now(),
-            timeout: self.timeout,
+            timeout: if Workers::of(job) == Workers::Trainings { Duration::MAX } else { self.timeout },
             has_overlay: false,
         };
         let ended = std::panic::catch_unwind(AssertUnwindSafe(|| run(&mut work)));
@@ -368,7 +405,7 @@ mod tests {
     }
 
     fn add(jobs: &Jobs) -> Arc<Job> {
-        jobs.add(JobKind::Find, b"{}", &[("depth", b"x")]).unwrap()
+        jobs.add((JobKind::Find, None), b"{}", &[("depth", b"x")]).unwrap()
     }
 
     fn wait(job: &Job) -> JobRecord {
@@ -417,7 +454,7 @@ mod tests {
             let jobs = open(dir.path());
             let (first, second) = (add(&jobs), add(&jobs));
             // As after a killed process.
-            assert_eq!(jobs.next().unwrap().id, first.id);
+            assert_eq!(jobs.next(Workers::Others).unwrap().id, first.id);
             std::fs::create_dir(jobs.folder.join(".0123.new")).unwrap();
             (first.id.clone(), second.id.clone())
         };
@@ -425,7 +462,7 @@ mod tests {
             let jobs = open(dir.path());
             let job = jobs.get(&first).unwrap();
             assert_eq!((job.state(), job.record.borrow().attempts), (JobState::Queued, attempt));
-            assert_eq!(jobs.next().unwrap().id, first);
+            assert_eq!(jobs.next(Workers::Others).unwrap().id, first);
             assert!(!jobs.folder.join(".0123.new").exists());
         }
         let jobs = open(dir.path());
@@ -462,7 +499,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         let jobs = open(dir.path());
         let all: Vec<_> = (0..4).map(|_| add(&jobs)).collect();
-        let error = jobs.add(JobKind::Find, b"{}", &[]).unwrap_err();
+        let error = jobs.add((JobKind::Find, None), b"{}", &[]).unwrap_err();
         assert_eq!(error.status, StatusCode::TOO_MANY_REQUESTS);
         assert_eq!(jobs.cancel(&all[3].id).unwrap().state(), JobState::Cancelled);
         assert_eq!(jobs.remove(&all[0].id).unwrap_err().status, StatusCode::CONFLICT);

@@ -26,6 +26,8 @@ pub(crate) enum JobKind {
     Object,
     /// Teaches an object from photographs, or stores a taught one.
     Teach,
+    /// Trains a network for a stored object.
+    Train,
 }
 
 /// Progress of a job.
@@ -71,6 +73,9 @@ pub(crate) struct JobRecord {
     /// Jobs are processed in the order of this number.
     pub number: u64,
     pub kind: JobKind,
+    /// The object that is trained.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub object: Option<String>,
     pub state: JobState,
     pub progress: Progress,
     /// Times in seconds since 1970.
@@ -93,6 +98,7 @@ impl JobRecord {
             id,
             number,
             kind,
+            object: None,
             state: JobState::Queued,
             progress: Progress::default(),
             created: now(),
@@ -151,6 +157,10 @@ impl Job {
             cancelled: AtomicBool::new(false),
             record: watch::Sender::new(record),
         }
+    }
+
+    pub fn kind(&self) -> JobKind {
+        self.record.borrow().kind
     }
 
     pub fn state(&self) -> JobState {

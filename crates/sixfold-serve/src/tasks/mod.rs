@@ -3,6 +3,8 @@
 pub(crate) mod find;
 pub(crate) mod grasps;
 pub(crate) mod object;
+#[cfg(feature = "networks")]
+pub(crate) mod train;
 
 use std::sync::Arc;
 
@@ -22,17 +24,21 @@ pub(crate) enum Request {
     Object(object::ObjectRequest),
     #[cfg(feature = "networks")]
     Teach(crate::teachings::TeachRequest),
+    #[cfg(feature = "networks")]
+    Train(train::TrainRequest),
 }
 
 impl Request {
     /// Stores the request as a job with these files.
     pub fn store_job(&self, app: &App, files: &[(&str, &[u8])]) -> Answer<Arc<Job>> {
         let kind = match self {
-            Request::Find(_) => JobKind::Find,
-            Request::Grasps(_) => JobKind::Grasps,
-            Request::Object(_) => JobKind::Object,
+            Request::Find(_) => (JobKind::Find, None),
+            Request::Grasps(_) => (JobKind::Grasps, None),
+            Request::Object(_) => (JobKind::Object, None),
             #[cfg(feature = "networks")]
-            Request::Teach(_) => JobKind::Teach,
+            Request::Teach(_) => (JobKind::Teach, None),
+            #[cfg(feature = "networks")]
+            Request::Train(request) => (JobKind::Train, Some(request.object())),
         };
         let bytes = serde_json::to_vec_pretty(self).map_err(|e| ApiError::system("the request", e))?;
         app.jobs.add(kind, &bytes, files)
@@ -52,5 +58,7 @@ pub(crate) fn run(app: &App, work: &mut Work<'_>) -> Result<serde_json::Value, S
         Request::Object(request) => object::run(app, &request, work),
         #[cfg(feature = "networks")]
         Request::Teach(request) => crate::teachings::run(app, &request, work),
+        #[cfg(feature = "networks")]
+        Request::Train(request) => train::run(app, &request, work),
     }
 }

@@ -52,7 +52,7 @@ pub(crate) struct LeftOutBody {
 }
 
 /// A body of JSON.
-pub(super) fn from_json<T: DeserializeOwned>(bytes: &[u8]) -> Answer<T> {
+pub(crate) fn from_json<T: DeserializeOwned>(bytes: &[u8]) -> Answer<T> {
     serde_json::from_slice(bytes)
         .map_err(|e| ApiError::about("body", e, "JSON as /v1/openapi.json describes it", "correct the body"))
 }

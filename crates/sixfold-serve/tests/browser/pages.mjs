@@ -1,7 +1,7 @@
 // Drives the pages of `sixfold serve` in a real browser, as a user would: adds an object, turns it, finds it in the demo's frame,
 // downloads the result, proposes grasps; teaches an object from photographs, corrects a pose and a mask, accepts it, finds it in
 // another image; teaches one without a board, with a length marked by mouse, then with a mesh; at a wide and a narrow size, with an
-// image of each page.
+// image of each page; starts and cancels a training.
 //
 //   npm install                                       (in this folder or a copy of it)
 //   cargo run --release -p sixfold-teach --example photographs -- data/demo/models/obj_000009.ply mm PHOTOGRAPHS
@@ -326,6 +326,26 @@ async function teach(page, address) {
   await shot(page, "teach-found");
 }
 
+/** Starts the training of the taught object, follows it after a reload, and cancels it. */
+async function train(page, address) {
+  await page.goto(address);
+  await page.locator('.object[data-name="duck"]').click();
+  await page.locator('#viewer[data-shown="duck"]').waitFor({ timeout: 30000 });
+  assert(await page.locator("#training").isHidden(), "an object without photographs is not trained");
+  await page.locator('.object[data-name="taught"]').click();
+  await page.getByRole("button", { name: "Train a network" }).click();
+  await page.locator("#train-status", { hasText: /making views .* \(\d+ of \d+\)/ }).waitFor({ timeout: 60000 });
+  await shot(page, "objects-training");
+  await page.reload();
+  await page.locator('.object[data-name="taught"]').click();
+  await page.locator("#train-status", { hasText: /\d+ of \d+/ }).waitFor({ timeout: 60000 });
+  await page.locator("#training").getByRole("button", { name: "Cancel" }).click();
+  await page.locator("#train-status .problem").waitFor({ timeout: 60000 });
+  assert.match(await page.locator("#train-status").innerText(), /Cancelled/);
+  await page.getByRole("button", { name: "Train a network" }).waitFor();
+  assert(await page.locator("#train-bar").isHidden());
+}
+
 const LENGTH = 0.2;
 
 /** The pixels at which a photograph on the cloth shows the two ends of the length. */
@@ -479,7 +499,7 @@ try {
     if (!url.startsWith(started.address) && !/^(blob|data):/.test(url)) faults.push(`asked for ${url}`);
   });
   page.setDefaultTimeout(30000);
-  const pages = { objects, find, grasp, teach, teachWithoutBoard };
+  const pages = { objects, find, grasp, teach, train, teachWithoutBoard };
   const wanted = (process.env.PAGES || Object.keys(pages).join()).split(",");
   for (const name of wanted) await pages[name](page, started.address);
   assert.deepEqual(faults, []);

@@ -11,3 +11,5 @@ mod support;
 mod teach;
 #[cfg(feature = "networks")]
 mod teach_without_board;
+#[cfg(feature = "networks")]
+mod train;

@@ -65,9 +65,9 @@ impl MethodArguments for AutoArguments {
     fn build(self, common: &CommonArguments) -> Result<Box<dyn PoseEstimator>> {
         let members = AutoMembers {
             pix2pose: self.weights.as_deref().map(|weights| (weights, common.object_id)),
-            without_views: false,
             depth: depth_options(self.keep_plane, common),
             seed: common.seed,
+            ..AutoMembers::default()
         };
         let mut auto = members.estimator()?;
         auto.budget = self.budget;

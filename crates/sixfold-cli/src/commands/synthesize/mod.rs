@@ -13,6 +13,7 @@ use sixfold_shell::Outcome;
 use sixfold_shell::folder::DatasetFolder;
 use sixfold_shell::new_views::NewViews;
 use sixfold_shell::output::report;
+use sixfold_shell::progress::Terminal;
 
 use self::arguments::WeightingKind;
 pub(crate) use self::arguments::{AFTER_HELP, SynthesizeArguments};
@@ -49,7 +50,7 @@ pub(crate) fn run(a: &SynthesizeArguments) -> Result<Outcome> {
         backgrounds: a.backgrounds.as_deref(),
         with_photographs: a.with_photographs,
     };
-    let (mut summary, sheets) = new.make(&folder, images)?;
+    let (mut summary, sheets) = new.make(&folder, images, &Terminal::default())?;
     summary.seconds = start.elapsed().as_secs_f64();
     report(&a.json, &summary, || summary.print())?;
     let found = !summary.objects.is_empty();

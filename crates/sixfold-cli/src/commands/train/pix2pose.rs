@@ -9,6 +9,7 @@ use sixfold_pix2pose::adversarial::AdversarialOptions;
 use sixfold_pix2pose::preset::Preset;
 use sixfold_pix2pose::recipe::{MIN_VISIBILITY, NetworkKind, Pix2PoseRecipe};
 use sixfold_pix2pose::training::Pix2PoseTrainingOptions;
+use sixfold_shell::progress::Terminal;
 
 use super::options::{self, Degrees, choices, presets};
 use super::{
@@ -193,6 +194,7 @@ pub(crate) fn train_pix2pose(a: &TrainPix2PoseArguments) -> Result<Summary<Learn
     let material = training_set(&a.material, MIN_VISIBILITY)?;
     let objects = material.objects.iter().map(|o| o.id).collect();
     let learnt_from = LearntFrom { objects, photographs: material.images.len() };
-    let trained = training::train_pix2pose(&recipe, material, &a.out, a.export, by_flag)?;
+    let trained =
+        training::train_pix2pose(&recipe, material, &a.out, a.export, &Terminal::default(), by_flag)?;
     Ok(summary(trained, |()| learnt_from))
 }
