@@ -15,6 +15,7 @@ use sixfold::estimator::{
 use sixfold::geometry::{Camera, Mask, Rect};
 use sixfold::mesh::{Mesh, ModelInfo};
 use sixfold::mttm::mask::to_image;
+use sixfold::pix2pose::aligned::MAX_STARTS;
 use sixfold::runner::{RunOptions, describe};
 
 use crate::arrays::{self, about, bad, seed, whole};
@@ -137,6 +138,8 @@ impl Searched {
 /// (mttm): "above" (default), for objects that stand on a table with their z axis up, or "around", for objects in any orientation
 /// (slower). refine (pix2pose, views): align the rendered outline with the image. For pix2pose this needs a mesh, and a network
 /// then refines the pose too, unless icp is set. passes (pix2pose): maximum number of passes over an object, 1 by default.
+/// starts (pix2pose): number of boxes from which a pose is estimated, 1 to 5, 1 by default: the given one and copies of it of other
+/// sizes; the pose with which the image agrees best is kept.
 /// icp (pix2pose): align poses with the depth image. seed: the seed of all random numbers.
 ///
 /// Raises ValueError for an unknown method, a changed option that the method does not have, or a file that is not such a network;
@@ -159,7 +162,7 @@ pub(crate) struct PyEstimator {
 #[pymethods]
 impl PyEstimator {
     #[new]
-    #[pyo3(signature = (method="auto", *, weights=None, keep_plane=false, matcher="both", templates_only=false, templates=None, refine=true, passes=None, icp=false, budget=None, seed=0))]
+    #[pyo3(signature = (method="auto", *, weights=None, keep_plane=false, matcher="both", templates_only=false, templates=None, refine=true, passes=None, starts=None, icp=false, budget=None, seed=0))]
     #[allow(clippy::too_many_arguments)]
     fn new(
         py: Python<'_>,
@@ -171,6 +174,7 @@ impl PyEstimator {
         templates: Option<String>,
         refine: bool,
         passes: Option<i64>,
+        starts: Option<i64>,
         icp: bool,
         budget: Option<f64>,
         seed: i64,
@@ -183,6 +187,7 @@ impl PyEstimator {
             templates,
             refine,
             passes: passes.map(|n| whole("passes", n, 1)).transpose()?,
+            starts: starts.map(self::starts).transpose()?,
             icp,
             budget,
             seed: self::seed(seed)?,
@@ -365,6 +370,14 @@ fn shape_of(py: Python<'_>, object: &Bound<'_, PyAny>) -> PyResult<(Arc<Mesh>, M
     let found = || bad("object", "a Mesh", object.get_type().to_string());
     let mesh = object.cast::<PyMesh>().map_err(|_| found())?.get();
     Ok((mesh.mesh.clone(), free(py, || mesh.info())?))
+}
+
+/// The number of boxes from which Pix2Pose starts.
+fn starts(value: i64) -> PyResult<usize> {
+    match usize::try_from(value) {
+        Ok(starts) if (1..=MAX_STARTS).contains(&starts) => Ok(starts),
+        _ => Err(bad("starts", format!("a whole number from 1 to {MAX_STARTS}"), value.to_string())),
+    }
 }
 
 /// A confidence threshold from 0 to 1.

@@ -30,6 +30,7 @@ pub(crate) struct Options {
     pub templates: Option<String>,
     pub refine: bool,
     pub passes: Option<usize>,
+    pub starts: Option<usize>,
     pub icp: bool,
     pub budget: Option<f64>,
     pub seed: u64,
@@ -39,7 +40,7 @@ pub(crate) struct Options {
 const METHODS: [(&str, &[&str]); 5] = [
     ("ppf", &["keep_plane"]),
     ("mttm", &["keep_plane", "weights", "matcher", "templates_only", "templates"]),
-    ("pix2pose", &["weights", "refine", "passes", "icp"]),
+    ("pix2pose", &["weights", "refine", "passes", "starts", "icp"]),
     ("views", &["weights", "refine"]),
     ("auto", &["weights", "keep_plane", "budget"]),
 ];
@@ -58,6 +59,7 @@ impl Options {
             ("templates", self.templates.clone()),
             ("refine", (!self.refine).then(|| "False".to_owned())),
             ("passes", self.passes.map(|p| p.to_string())),
+            ("starts", self.starts.map(|s| s.to_string())),
             ("icp", self.icp.then(|| "True".to_owned())),
             ("budget", self.budget.map(|b| b.to_string())),
         ];
@@ -161,6 +163,9 @@ pub(crate) fn make(py: Python<'_>, method: &str, options: &Options) -> PyResult<
             estimator.options.estimate.seed = options.seed;
             if let Some(passes) = options.passes {
                 estimator.options.passes = passes;
+            }
+            if let Some(starts) = options.starts {
+                estimator.options.starts = starts;
             }
             estimator.refine = options.refine;
             let refiner = interruptible(py, |_| ViewsRefiner::shipped())?.map_err(|e| file_or_value(&e))?;

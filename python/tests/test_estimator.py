@@ -39,7 +39,7 @@ def test_what_the_methods_need(weights):
     assert sixfold.Estimator("mttm", matcher="points").needs == ppf.needs
     pix2pose = sixfold.Estimator("pix2pose", weights=weights)
     assert pix2pose.needs == {"depth": "unused", "rgb": "required", "region": "required", "object": "optional"}
-    aligned = sixfold.Estimator("pix2pose", weights=weights, icp=True, passes=2, refine=False)
+    aligned = sixfold.Estimator("pix2pose", weights=weights, icp=True, passes=2, starts=2, refine=False)
     assert aligned.needs["depth"] == aligned.needs["object"] == "required"
 
 
@@ -158,6 +158,8 @@ def test_options_of_other_methods_are_refused(tmp_path):
         ("pix2pose", {}, "weights"),
         ("pix2pose", {"weights": "w.safetensors", "keep_plane": True}, "keep_plane"),
         ("pix2pose", {"weights": "w.safetensors", "passes": 0}, "passes"),
+        ("pix2pose", {"weights": "w.safetensors", "starts": 6}, "starts"),
+        ("views", {"starts": 2}, "starts"),
         ("auto", {"icp": True}, "icp"),
         ("ppf", {"budget": 1.0}, "budget"),
         ("auto", {"budget": 0.0}, "budget"),

@@ -26,6 +26,10 @@ pub struct AlignOptions {
     /// Maximum number of iterations: each after the first uses the box of the previous pose; they stop when the box does not
     /// change.
     pub passes: usize,
+    /// Number of boxes from which a pose is estimated: the given one and copies of it of other sizes. The pose with which the image
+    /// agrees best is kept; without a refiner, the one with the highest score. Helps with inaccurate boxes and against wrong
+    /// rotations, and takes that many times as long.
+    pub starts: usize,
     /// Weight of the refiner's pose, 0 to 1, in the final one; the rest is that of the aligned outline. Their errors are different,
     /// so that a mean is nearer than either. 0: the refiner is not used. Chosen by ADD(-S)
     /// recall on 602 targets of 84 LM-O development frames, ground-truth boxes: with 0, 0.3, 0.4, 0.5 .518, .548, .548, .565;
@@ -35,12 +39,18 @@ pub struct AlignOptions {
     pub correct: bool,
 }
 
+/// Sizes of the boxes of [`AlignOptions::starts`], relative to the given one.
+const START_SIZES: [f64; 5] = [1.0, 0.8, 1.25, 0.64, 1.5];
+/// Largest number of starts.
+pub const MAX_STARTS: usize = START_SIZES.len();
+
 impl Default for AlignOptions {
     fn default() -> Self {
         Self {
             estimate: Pix2PoseOptions::default(),
             refine: OutlineRefinementOptions::default(),
             passes: 1,
+            starts: 1,
             refiner_weight: 0.5,
             correct: true,
         }
@@ -66,7 +76,8 @@ impl AlignOptions {
         self.estimate.check()?;
         self.refine.check()?;
         OptionError::unless_fraction("refiner_weight", self.refiner_weight)?;
-        OptionError::unless_some("passes", self.passes)
+        OptionError::unless_some("passes", self.passes)?;
+        OptionError::unless_within("starts", self.starts, 1..=MAX_STARTS, "1 to 5")
     }
 }
 
@@ -108,42 +119,87 @@ pub fn estimate_aligned(
     region: &Rect,
     options: &AlignOptions,
 ) -> Result<Option<Aligned>, EstimateError> {
-    let AlignedObject { id: object_id, outline: mesh, refiner } = object;
-    let run_pass = |region: &Rect| -> Result<Option<Aligned>, EstimateError> {
-        let Some(found) = estimate(model, image, camera, object_id, region, &options.estimate)? else {
+    let search = Search { model, image, camera, object, options };
+    let mut best = search.from(region)?;
+    for size in &START_SIZES[1..options.starts.clamp(1, MAX_STARTS)] {
+        // A copy of the box can lie outside the image although the box does not.
+        let Ok(Some(other)) = search.from(&scaled(region, *size)) else { continue };
+        if best.as_ref().is_none_or(|best| other.value() > best.value()) {
+            best = Some(other);
+        }
+    }
+    if let Some(best) = best.as_mut().filter(|best| options.correct && best.improved) {
+        let correction = model.object(object.id)?.1.correction;
+        best.camera_from_object = correction.apply(camera, &best.camera_from_object);
+    }
+    Ok(best)
+}
+
+/// A box of the same centre, its sides multiplied by a factor.
+fn scaled(region: &Rect, factor: f64) -> Rect {
+    let (width, height) = (factor * region.width, factor * region.height);
+    let (x, y) = (region.x + 0.5 * (region.width - width), region.y + 0.5 * (region.height - height));
+    Rect { x, y, width, height }
+}
+
+impl Aligned {
+    /// By which the pose from several boxes is chosen: the agreement; the score where there is no refiner.
+    fn value(&self) -> (f64, f64) {
+        (self.agreement.unwrap_or(0.0), self.score)
+    }
+}
+
+/// The search for one object in one image.
+struct Search<'a> {
+    model: &'a Pix2PoseModel,
+    image: &'a RgbImage,
+    camera: &'a Camera,
+    object: AlignedObject<'a>,
+    options: &'a AlignOptions,
+}
+
+impl Search<'_> {
+    /// The aligned and refined pose from a box, before the correction.
+    fn from(&self, region: &Rect) -> Result<Option<Aligned>, EstimateError> {
+        let Some(mut best) = self.pass(region)? else { return Ok(None) };
+        let mut last_box = *region;
+        for _ in 1..self.options.passes.max(1) {
+            let Some(whole) = projected_box(self.object.outline, self.camera, &best.camera_from_object)
+            else {
+                break;
+            };
+            if !best.improved || !alike(&whole, region) || same(&whole, &last_box) {
+                break;
+            }
+            let Ok(Some(again)) = self.pass(&whole) else { break };
+            if !again.improved {
+                break;
+            }
+            (best, last_box) = (again, whole);
+        }
+        if let Some(refiner) = self.object.refiner.filter(|_| self.options.refiner_weight > 0.0) {
+            let aligned = best.camera_from_object;
+            let refined = refiner.refine(self.image, self.camera, &aligned).map_err(refiner_error)?;
+            best.agreement = refined.map(|r| r.agreement);
+            if let Some(refined) = refined {
+                let weight = self.options.refiner_weight;
+                best.camera_from_object = between(&aligned, &refined.camera_from_object, weight);
+            }
+        }
+        Ok(Some(best))
+    }
+
+    /// Both passes of the network, PnP, and the alignment of the outline.
+    fn pass(&self, region: &Rect) -> Result<Option<Aligned>, EstimateError> {
+        let Search { model, image, camera, object, options } = *self;
+        let Some(found) = estimate(model, image, camera, object.id, region, &options.estimate)? else {
             return Ok(None);
         };
-        let refined = refine(image, camera, mesh, &found, &options.refine);
+        let refined = refine(image, camera, object.outline, &found, &options.refine);
         let score = found.hypotheses.first().map_or(0.0, |h| h.score);
         let (camera_from_object, improved) = (refined.camera_from_object, refined.improved);
         Ok(Some(Aligned { camera_from_object, score, improved, agreement: None, found }))
-    };
-    let Some(mut best) = run_pass(region)? else { return Ok(None) };
-    let mut last_box = *region;
-    for _ in 1..options.passes.max(1) {
-        let Some(whole) = projected_box(mesh, camera, &best.camera_from_object) else { break };
-        if !best.improved || !alike(&whole, region) || same(&whole, &last_box) {
-            break;
-        }
-        let Ok(Some(again)) = run_pass(&whole) else { break };
-        if !again.improved {
-            break;
-        }
-        (best, last_box) = (again, whole);
     }
-    if let Some(refiner) = refiner.filter(|_| options.refiner_weight > 0.0) {
-        let aligned = best.camera_from_object;
-        let refined = refiner.refine(image, camera, &aligned).map_err(refiner_error)?;
-        best.agreement = refined.map(|r| r.agreement);
-        if let Some(refined) = refined {
-            best.camera_from_object = between(&aligned, &refined.camera_from_object, options.refiner_weight);
-        }
-    }
-    if options.correct && best.improved {
-        let correction = model.object(object_id)?.1.correction;
-        best.camera_from_object = correction.apply(camera, &best.camera_from_object);
-    }
-    Ok(Some(best))
 }
 
 fn refiner_error(error: EstimatorError) -> EstimateError {
@@ -296,6 +352,8 @@ mod tests {
         assert_eq!(options.check(), Ok(()));
         let named = |options: AlignOptions| options.check().unwrap_err().option;
         assert_eq!(named(AlignOptions { passes: 0, ..options.clone() }), "passes");
+        assert_eq!(named(AlignOptions { starts: 0, ..options.clone() }), "starts");
+        assert_eq!(named(AlignOptions { starts: MAX_STARTS + 1, ..options.clone() }), "starts");
         assert_eq!(named(AlignOptions { refiner_weight: 1.5, ..options.clone() }), "refiner_weight");
         let estimate = Pix2PoseOptions { thresholds: vec![0.1, f32::NAN], ..options.estimate.clone() };
         assert_eq!(named(AlignOptions { estimate, ..options.clone() }), "thresholds");

@@ -113,8 +113,7 @@ function showTraining(object) {
 
 function showStep(job) {
   const { step, done, total } = job.progress;
-  byId("train-bar").max = total || 1;
-  byId("train-bar").value = done;
+  byId("train-bar").firstElementChild.style.width = `${Math.max(4, 100 * done / (total || 1))}%`;
   byId("train-status").textContent = job.state === "queued" ? "Waiting for another training ..." : `${step} (${done} of ${total})`;
 }
 

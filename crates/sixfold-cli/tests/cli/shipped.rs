@@ -81,6 +81,34 @@ fn the_shipped_pix2pose_on_real_frames() {
 }
 
 #[test]
+fn more_starts_agree_better_with_the_image() {
+    let dir = tempfile::tempdir().unwrap();
+    let demo = |path: &str| root().join("data/demo").join(path).display().to_string();
+    let weights = root().join("weights/pix2pose-lmo.safetensors");
+    let image = format!("--rgb {} --camera {}", demo("test/000002/rgb/000003.png"), demo("camera.json"));
+    // A box that is too small for the object and not centred on it.
+    let object =
+        format!("--object {} --unit mm --object-id 9 --box 360,300,60,45", demo("models/obj_000009.ply"));
+    let pose = |starts: usize| {
+        let estimate = format!("estimate --method pix2pose --weights {} {image} {object}", weights.display());
+        let answer =
+            sixfold(dir.path(), &format!("{estimate} --starts {starts} --out o --json")).expect(0).json();
+        answer["poses"][0].clone()
+    };
+    let (one, three) = (pose(1), pose(3));
+    let agreement = |pose: &Value| pose["agreement"].as_f64().unwrap();
+    assert!(agreement(&three) > agreement(&one) + 0.005, "{} and {}", agreement(&one), agreement(&three));
+    // The duck is at a distance of 0.984 m.
+    let off = |pose: &Value| (pose["camera_from_object"][2][3].as_f64().unwrap() - 0.984).abs();
+    assert!(off(&three) < off(&one), "{} and {}", off(&one), off(&three));
+    fails(
+        dir.path(),
+        &format!("estimate --method pix2pose --weights w {image} {object} --starts 6"),
+        &["--starts", "5"],
+    );
+}
+
+#[test]
 fn the_shipped_detector_on_real_frames() {
     let Some(lmo) = lmo() else { return };
     let dir = tempfile::tempdir().unwrap();

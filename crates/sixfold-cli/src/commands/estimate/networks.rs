@@ -15,6 +15,7 @@ use sixfold_estimator::{ObjectDetector, PoseEstimator, Region};
 use sixfold_geometry::RgbImage;
 use sixfold_mttm::model::MttmModel;
 use sixfold_mttm::{MatchedBy, MttmEstimator};
+use sixfold_pix2pose::aligned::MAX_STARTS;
 use sixfold_pix2pose::model::Pix2PoseModel;
 use sixfold_pix2pose::own_weights::OwnWeights;
 use sixfold_runner::RegionSource;
@@ -119,6 +120,10 @@ struct Pix2PoseArguments {
     /// inaccurate boxes, and takes as long as the first
     #[arg(long, alias = "looks", value_name = "N", value_parser = count::<100>, conflicts_with = "preset")]
     passes: Option<NonZeroUsize>,
+    /// Number of boxes from which a pose is estimated, 1 to 5 (default: 1): the given one and copies of it of other sizes. The pose
+    /// with which the image agrees best is kept. Takes that many times as long
+    #[arg(long, value_name = "N", value_parser = count::<{ MAX_STARTS }>, conflicts_with = "preset")]
+    starts: Option<NonZeroUsize>,
     /// Align poses with the depth image (ICP)
     #[arg(long)]
     icp: bool,
@@ -130,6 +135,9 @@ impl MethodArguments for Pix2PoseArguments {
         own.options.estimate.seed = common.seed;
         if let Some(passes) = self.passes {
             own.options.passes = passes.get();
+        }
+        if let Some(starts) = self.starts {
+            own.options.starts = starts.get();
         }
         own.refine &= !self.no_refine;
         own.icp = self.icp;
