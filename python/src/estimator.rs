@@ -131,8 +131,8 @@ impl Searched {
 ///   detector.
 /// - "auto": all methods that the images allow, one after the other, until one is certain. Each pose has a probability.
 ///
-/// weights: the network of pix2pose (required); for mttm and views a network instead of the built-in one; for auto the network of
-/// pix2pose, without which pix2pose is left out. budget (auto): seconds per object after which no further method starts; poses then
+/// weights: the network of pix2pose (required; that of a taught object is `pix2pose.safetensors` in its folder of the store); for
+/// mttm and views a network instead of the built-in one; for auto the network of pix2pose, without which pix2pose is left out. budget (auto): seconds per object after which no further method starts; poses then
 /// depend on the speed of the machine. keep_plane (ppf, mttm, auto): also search points on the table plane. matcher (mttm):
 /// "points", "network" or "both". templates_only (mttm): verify poses with the templates only, as if there were no mesh. templates
 /// (mttm): "above" (default), for objects that stand on a table with their z axis up, or "around", for objects in any orientation

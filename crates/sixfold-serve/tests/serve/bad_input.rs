@@ -133,12 +133,14 @@ fn of_images() -> Vec<Case> {
 fn of_choices() -> Vec<Case> {
     let plain = |status, field, word, form: Form| Case { path: "/v1/find", form, status, field, word };
     let duck = |name: &str, value: &str| frame().text("objects", "duck").text(name, value);
+    let with_networks = cfg!(feature = "networks");
+    let pix2pose = if with_networks { ("box", "a box or a mask") } else { ("method", "networks") };
     vec![
         plain(404, "objects", "teapot", frame().text("objects", "duck,teapot")),
         plain(400, "objects", "letters", frame().text("objects", "../../etc/passwd")),
         plain(422, "objects", "0 names", frame()),
         plain(422, "method", "guess", duck("method", "guess")),
-        plain(422, "method", "--pix2pose", duck("method", "pix2pose")),
+        plain(422, pix2pose.0, pix2pose.1, duck("method", "pix2pose")),
         plain(422, "instances", "0", duck("instances", "0")),
         plain(422, "instances", "many", duck("instances", "many")),
         plain(422, "min_confidence", "-1", duck("min_confidence", "-1")),
