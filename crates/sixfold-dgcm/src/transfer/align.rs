@@ -94,9 +94,6 @@ pub struct Transferred {
     /// Root mean square of the point-to-plane distances after ICP, metres; `None` if the result of ICP was not used, because it had
     /// too few correspondences or moved too far.
     pub rms: Option<f64>,
-    /// Mean distance of the experience's visible surface, at this pose, to the object's, plus that of the object's to the experience's,
-    /// metres; each distance counts at most 2 cm.
-    pub misfit: f64,
     /// Size of the region here relative to that in the experience, along the experience's camera axes.
     pub scale: Vec3,
 }
@@ -147,26 +144,24 @@ pub fn transfer(
         let start = rotation.with_translation(target.centre - source.centre);
         let scale = target.half.component_div(&source.half);
         let (pose, rms) = refine(experience, &wanted, cloud, &start, options);
-        let misfit = misfit(input, cloud, experience, &pose);
-        found.push(Transferred {
-            camera_from_experience: pose,
-            hypothesis,
-            pixels: here.len(),
-            rms,
-            misfit,
-            scale,
-        });
+        found.push(Transferred { camera_from_experience: pose, hypothesis, pixels: here.len(), rms, scale });
     }
     found
 }
 
-/// Limit of the distances in [`Transferred::misfit`], metres.
+/// Limit of the distances in [`misfit`], metres.
 const FARTHEST: f64 = 0.02;
 /// Every how many pixels of a crop their distance is measured.
 const MEASURED: usize = 3;
 
-/// [`Transferred::misfit`] of a pose.
-fn misfit(input: &Crop, cloud: &IndexedCloud, experience: &Crop, camera_from_experience: &Pose) -> f64 {
+/// Mean distance of an experience's visible surface, at a pose, to the object's, plus that of the object's to the experience's, metres;
+/// each distance counts at most [`FARTHEST`].
+pub(super) fn misfit(
+    input: &Crop,
+    cloud: &IndexedCloud,
+    experience: &Crop,
+    camera_from_experience: &Pose,
+) -> f64 {
     let points = |crop: &Crop| -> Vec<Vec3> {
         let all: Vec<usize> = crop.pixels().collect();
         all.iter().step_by(MEASURED).map(|&i| crop.point(i)).collect()

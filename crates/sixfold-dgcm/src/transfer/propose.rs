@@ -11,7 +11,7 @@ use thiserror::Error;
 
 use super::Memory;
 use super::align::{
-    AlignmentHypothesis, ExperienceAlignmentOptions, Transferred, noc, pixels_near, transfer,
+    AlignmentHypothesis, ExperienceAlignmentOptions, Transferred, misfit, noc, pixels_near, transfer,
 };
 use crate::model::DgcmModel;
 
@@ -45,8 +45,8 @@ pub struct ProposeOptions {
     /// How far the tips reach over the nearest point of the object's surface, metres: the dissertation's fixed distance, at which a
     /// grasp is used as transferred. `None`: as far as in the experience, at the nearest pose where the gripper is free.
     pub reach: Option<f64>,
-    /// The score of a grasp falls to 1/e if its alignment's [misfit](super::Transferred::misfit) is larger by this than the smallest,
-    /// metres. `None`: the score is that of equation 6.6, however well the surfaces fit.
+    /// The score of a grasp falls to 1/e if the mean distances between the visible surfaces, in both directions, are together larger by
+    /// this than for the best alignment, metres. `None`: the score is that of equation 6.6, however well the surfaces fit.
     pub fit_scale: Option<f64>,
     /// Only experiences on parts with this name.
     pub part: Option<String>,
@@ -272,7 +272,9 @@ pub fn propose(
                     };
                     placed.map(|(grasp, moved, firm)| {
                         let (score, hypothesis) = ((-from.distance).exp(), t.hypothesis);
-                        (Proposal { grasp, score, from: *from, hypothesis, moved, firm }, t.misfit)
+                        let pose = &t.camera_from_experience;
+                        let misfit = options.fit_scale.map_or(0.0, |_| misfit(&crop, &cloud, copy, pose));
+                        (Proposal { grasp, score, from: *from, hypothesis, moved, firm }, misfit)
                     })
                 })
                 .collect()
@@ -411,6 +413,7 @@ mod tests {
     fn options_out_of_range_are_named() {
         let options = ProposeOptions::default();
         assert_eq!(options.check(), Ok(()));
+        assert!(options.fit_scale.is_some() && ProposeOptions::published().fit_scale.is_none());
         let none = ProposeOptions { neighbours: 0, ..options.clone() };
         assert_eq!(none.check().unwrap_err().option, "neighbours");
         let flat = ProposeOptions { fit_scale: Some(0.0), ..options.clone() };

@@ -126,7 +126,6 @@ fn counterparts(here: &Shape, from: Match, stored: &Arc<Stored>) -> Vec<Counterp
                 hypothesis: AlignmentHypothesis::Upright,
                 pixels: held.len(),
                 rms: None,
-                misfit: 0.0,
                 scale: Vec3::repeat(u.stretch[0]),
             };
             Counterpart {
