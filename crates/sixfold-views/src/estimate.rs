@@ -17,6 +17,7 @@ use crate::error::ViewsError;
 use crate::features::{Extractor, FeatureMap};
 use crate::matching::{Match, best_near, dot, mutual_matches, similarity};
 use crate::network::input;
+use crate::printed::{ImageKeypoints, PrintMatches, Printed};
 use crate::refiner::{Refiner, Target};
 use crate::templates::{CROP_FACTOR, Template, cells_on_object, gathered, input_over_grey, render};
 
@@ -56,6 +57,8 @@ pub struct ViewsOptions {
     /// Weight of the similarity of colours, relative to that of features, when proposals are compared with templates; without
     /// effect for objects without colours and in grey images.
     pub place_colour: f32,
+    /// Number of poses by what is printed on the object that are refined in that crop, plus one for each further instance.
+    pub printed: usize,
     /// Seed of RANSAC.
     pub seed: u64,
 }
@@ -91,6 +94,7 @@ impl Default for ViewsOptions {
             places: 8,
             place_hypotheses: 6,
             place_colour: 0.5,
+            printed: 6,
             seed: 0,
         }
     }
@@ -141,6 +145,8 @@ pub(crate) struct Views<'a> {
     pub outline: &'a Mesh,
     /// Its templates.
     pub templates: &'a [Template],
+    /// What is printed on the object; none for an object without colours.
+    pub printed: Option<&'a Printed>,
     /// Refines poses; without one the products of features are used.
     pub refiner: Option<&'a Refiner>,
     /// Options.
@@ -159,6 +165,10 @@ const DECIDED: f32 = 0.9;
 const MAX_GROWTH: f64 = 4.0;
 /// An aligned outline is kept unless the agreement of features drops by more than this; chosen by hand, not swept.
 const TOLERANCE: f64 = 0.02;
+/// Number of keypoints that agree with a wrong pose by chance.
+const CHANCE: usize = 6;
+/// Each further `PRINT` keypoints that agree divide the disagreement with the image by e.
+const PRINT: f64 = 20.0;
 /// Objects rendered closer than this would be inside the camera, diameters.
 const MIN_DISTANCE: f64 = 0.3;
 
@@ -172,6 +182,7 @@ impl Views<'_> {
         image: &RgbImage,
         camera: &Camera,
         bbox: &Rect,
+        keypoints: Option<&ImageKeypoints>,
     ) -> Result<Option<Vec<Hypothesis>>, ViewsError> {
         let Some(part) = Part::new(self.extractor, image, camera, bbox, self.options.side)? else {
             return Ok(None);
@@ -179,10 +190,32 @@ impl Views<'_> {
         let ranked = self.ranked(&part);
         let mut hypotheses = self.coarse(&part, &ranked, self.options.hypotheses)?;
         let close = self.options.close.min(hypotheses.len());
-        let closer =
-            self.closer_all(hypotheses[..close].iter().map(|h| (*h, *bbox)).collect(), image, camera)?;
+        let inside = keypoints.map(|keypoints| keypoints.within(&bbox.scaled(CROP_FACTOR)));
+        let prints = self.prints(inside.as_ref(), camera);
+        let mut chosen: Vec<(Hypothesis, Rect)> = hypotheses[..close].iter().map(|h| (*h, *bbox)).collect();
+        chosen.extend(self.by_print(prints.as_ref(), camera, 1));
+        let closer = self.closer_all(chosen, prints.as_ref(), image, camera)?;
         hypotheses.splice(..close, closer);
         Ok(Some(hypotheses))
+    }
+
+    /// The matches of what is printed on the object with an image's keypoints.
+    pub(crate) fn prints(&self, keypoints: Option<&ImageKeypoints>, camera: &Camera) -> Option<PrintMatches> {
+        Some(self.printed?.matches(keypoints?, camera))
+    }
+
+    /// Poses by what is printed on the object, with their boxes in the image.
+    pub(crate) fn by_print(
+        &self,
+        prints: Option<&PrintMatches>,
+        camera: &Camera,
+        instances: usize,
+    ) -> Vec<(Hypothesis, Rect)> {
+        let Some(prints) = prints else { return vec![] };
+        let boxed =
+            |pose: Hypothesis| Some((pose, projected_box(self.outline, camera, &pose.camera_from_object)?));
+        let most = self.options.printed.saturating_add(instances - 1);
+        prints.poses().into_iter().take(most).filter_map(boxed).collect()
     }
 
     /// The templates most similar to a crop, best first: number and similarity.
@@ -223,12 +256,20 @@ impl Views<'_> {
     pub(crate) fn closer_all(
         &self,
         poses: Vec<(Hypothesis, Rect)>,
+        prints: Option<&PrintMatches>,
         image: &RgbImage,
         camera: &Camera,
     ) -> Result<Vec<Hypothesis>, ViewsError> {
         let closer: Result<Vec<Hypothesis>, ViewsError> =
             poses.into_par_iter().map(|(h, bbox)| self.closer(h, image, camera, &bbox)).collect();
         let mut closer = closer?;
+        if let Some(prints) = prints {
+            for hypothesis in &mut closer {
+                let agreeing = prints.agreeing(&hypothesis.camera_from_object);
+                let doubt = (-(agreeing.saturating_sub(CHANCE) as f64) / PRINT).exp();
+                hypothesis.similarity = 1.0 - (1.0 - hypothesis.similarity) * doubt;
+            }
+        }
         closer.sort_by(|a, b| b.similarity.total_cmp(&a.similarity));
         Ok(closer)
     }
@@ -592,10 +633,11 @@ pub(crate) mod tests {
                 mesh: &mesh,
                 outline: &mesh,
                 templates: &templates,
+                printed: None,
                 refiner: None,
                 options: &options,
             };
-            views.find(&image, &camera, bbox).unwrap().unwrap()
+            views.find(&image, &camera, bbox, None).unwrap().unwrap()
         };
         for outline in [false, true] {
             let found = find(outline, &bbox);

@@ -18,6 +18,7 @@ use crate::estimate::{Hypothesis, Views, ViewsOptions};
 use crate::features::Extractor;
 use crate::file;
 use crate::network::{ViewNetwork, shipped_hash};
+use crate::printed::{KeptKeypoints, Printed};
 use crate::refiner::Refiner;
 use crate::refiner::network::RefinerNetwork;
 use crate::search::Places;
@@ -96,30 +97,31 @@ impl ViewsEstimator {
         hash.value()
     }
 
-    /// The templates kept in the object's folder, or newly rendered ones.
-    fn templates_of(
+    /// The views kept in the object's folder, or newly rendered ones.
+    fn views_of(
         &self,
         object: &Object,
         mesh: &Mesh,
         diameter: f64,
         key: u64,
         notes: &mut Vec<String>,
-    ) -> Result<Vec<Template>, ViewsError> {
+    ) -> Result<(Vec<Template>, Printed), ViewsError> {
         let kept = object.file(FILE);
         if let Some(path) = &kept {
             match file::read(path, key) {
-                Ok(Some(templates)) => return Ok(templates),
+                Ok(Some((templates, views))) => return Ok((templates, Printed { views, diameter })),
                 Ok(None) => {}
                 Err(error) => notes.push(format!("views of {} rendered again: {error}", object.name)),
             }
         }
         let templates = make_templates(mesh, &object.name, diameter, &self.extractor, &self.templates)?;
+        let printed = Printed::of_mesh(mesh, diameter);
         if let Some(path) = &kept
-            && let Err(error) = file::write(path, key, &templates)
+            && let Err(error) = file::write(path, key, &templates, &printed.views)
         {
             notes.push(format!("views of {} not kept: {error}", object.name));
         }
-        Ok(templates)
+        Ok((templates, printed))
     }
 }
 
@@ -130,6 +132,7 @@ pub struct ViewsObject {
     view: Mesh,
     outline: Mesh,
     templates: Vec<Template>,
+    printed: Printed,
     notes: Vec<String>,
 }
 
@@ -172,7 +175,7 @@ impl PoseEstimator for ViewsEstimator {
         self.templates.check().map_err(EstimatorError::method)?;
         let view = view_mesh(&mesh);
         let key = self.key(&mesh, diameter);
-        let templates = self.templates_of(object, &view, diameter, key, &mut notes).map_err(wrap)?;
+        let (templates, printed) = self.views_of(object, &view, diameter, key, &mut notes).map_err(wrap)?;
         if mesh.colors().is_none() && mesh.texture().is_none() {
             notes.push(format!(
                 "{}: its mesh has no colours, its views are grey: expect fewer and less precise poses",
@@ -180,7 +183,15 @@ impl PoseEstimator for ViewsEstimator {
             ));
         }
         let outline = outline_mesh(&mesh);
-        Ok(Box::new(ViewsObject { name: object.name.clone(), mesh, view, outline, templates, notes }))
+        Ok(Box::new(ViewsObject {
+            name: object.name.clone(),
+            mesh,
+            view,
+            outline,
+            templates,
+            printed,
+            notes,
+        }))
     }
 
     fn estimate(
@@ -196,9 +207,13 @@ impl PoseEstimator for ViewsEstimator {
             mesh: &object.view,
             outline: &object.outline,
             templates: &object.templates,
+            printed: Some(&object.printed),
             refiner: self.refiner.as_deref(),
             options: &self.options,
         };
+        let keypoints = (!object.printed.views.is_empty())
+            .then(|| query.memo.get_or_default::<KeptKeypoints>().of_image(image));
+        let keypoints = keypoints.as_deref();
         let estimate = |pose: &Hypothesis, score: f64| {
             let confidence = pose.similarity.clamp(0.0, 1.0) * score;
             let mut estimate = PoseEstimate::new(pose.camera_from_object, confidence);
@@ -217,14 +232,15 @@ impl PoseEstimator for ViewsEstimator {
             let sizes = [self.options.proposals, self.options.side];
             let kept: Arc<Places> = query.memo.get_or_default();
             let places = kept.of_image(proposals, &self.extractor, image, query.camera, sizes)?;
-            let found = views.search(image, query.camera, &places, query.max_instances);
+            let found = views.search(image, query.camera, &places, keypoints, query.max_instances);
             return Ok(found
                 .map_err(EstimatorError::method)?
                 .iter()
                 .filter_map(|h| estimate(h, 1.0))
                 .collect());
         };
-        let found = views.find(image, query.camera, &region.bbox).map_err(EstimatorError::method)?;
+        let found =
+            views.find(image, query.camera, &region.bbox, keypoints).map_err(EstimatorError::method)?;
         let Some(found) = found else {
             let source = format!(
                 "box {:.0},{:.0},{:.0},{:.0}: expected pixels of the image, found none",

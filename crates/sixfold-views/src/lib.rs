@@ -21,10 +21,12 @@ mod file;
 mod matching;
 mod network;
 mod pose_refiner;
+mod printed;
 pub mod recipe;
 pub mod refiner;
 mod samples;
 mod search;
+mod sift;
 mod templates;
 mod training;
 

@@ -66,6 +66,7 @@ impl RefinedObject for Refined {
             mesh: &self.view,
             outline: &self.outline,
             templates: &[],
+            printed: None,
             refiner: Some(&self.by.refiner),
             options: &self.by.options,
         };

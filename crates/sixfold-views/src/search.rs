@@ -15,6 +15,7 @@ use crate::error::ViewsError;
 use crate::estimate::{Hypothesis, Part, Views};
 use crate::features::Extractor;
 use crate::matching::{colour_similarity, quick_similarity};
+use crate::printed::ImageKeypoints;
 use crate::templates::Template;
 
 /// Boxes of two poses that overlap more than this (intersection over union) belong to one instance.
@@ -78,6 +79,7 @@ impl Views<'_> {
         image: &RgbImage,
         camera: &Camera,
         places: &[Place],
+        keypoints: Option<&ImageKeypoints>,
         instances: usize,
     ) -> Result<Vec<Hypothesis>, ViewsError> {
         let mut alike: Vec<(&Place, f32)> =
@@ -99,7 +101,9 @@ impl Views<'_> {
                 chosen.push((pose, alike[number].0.bbox));
             }
         }
-        let found = self.closer_all(chosen, image, camera)?;
+        let prints = self.prints(keypoints, camera);
+        chosen.extend(self.by_print(prints.as_ref(), camera, instances));
+        let found = self.closer_all(chosen, prints.as_ref(), image, camera)?;
         let mut kept: Vec<Hypothesis> = Vec::new();
         for hypothesis in found {
             if kept.len() < instances && kept.iter().all(|k| !self.one(camera, k, &hypothesis)) {
@@ -157,6 +161,7 @@ mod tests {
                 mesh: &mesh,
                 outline: &mesh,
                 templates: &templates,
+                printed: None,
                 refiner: None,
                 options: &options,
             };

@@ -186,7 +186,7 @@ pub(crate) fn directions(count: usize) -> Vec<Vec3> {
 
 /// The rotation of a camera that views an object from a direction, with the object's z axis up (if it is not along the view),
 /// followed by an in-plane rotation.
-fn rotation_from(direction: &Vec3, roll: f64) -> UnitQuaternion<f64> {
+pub(crate) fn rotation_from(direction: &Vec3, roll: f64) -> UnitQuaternion<f64> {
     let up = if direction.z.abs() > 0.999 { Vec3::y() } else { Vec3::z() };
     let z = -direction;
     let x = z.cross(&up).normalize();
@@ -260,21 +260,15 @@ const CHUNK: usize = 64;
 
 /// A template without features, and the network's input for these; `None` for a side from which nothing is visible.
 fn render_side(
-    (wide, close): &mut (VisibilityBuffer, VisibilityBuffer),
+    frames: &mut (VisibilityBuffer, VisibilityBuffer),
     mesh: &Mesh,
     rotation: &UnitQuaternion<f64>,
     diameter: f64,
     options: &TemplateOptions,
 ) -> Option<(Template, Vec<f32>)> {
-    let (low, high) = mesh.bounding_box();
-    let away = Vec3::new(0.0, 0.0, options.distance * diameter);
-    let pose = Pose::new(*rotation, away - rotation * ((low + high) * 0.5));
-    wide.render(&[SceneObject { mesh, camera_from_object: pose }], &RenderOptions::default());
-    let bbox: Rect = wide.bounding_box()?;
-    let crop = Crop::of_box(wide.camera(), &bbox, options.crop_factor, options.side)?;
-    close.set_camera(&crop.camera);
-    let crop_from_object = crop.to_crop(&pose);
-    let rendered = render(close, mesh, &crop_from_object, None);
+    let away = options.distance * diameter;
+    let (crop_from_object, rendered) =
+        side_view(frames, mesh, rotation, away, options.crop_factor, options.side)?;
     let (cells, points) = cells_on_object(&rendered, options.side / CELL);
     let input = input_over_grey(&rendered);
     let mut colours = Vec::new();
@@ -283,9 +277,37 @@ fn render_side(
         let all = chromas(&Patch::from_rgb(&rendered.image).data, options.side, shown);
         colours = cells.iter().map(|cell| all[usize::from(*cell)]).collect();
     }
-    let template =
-        Template { crop_from_object, camera: crop.camera, cells, features: vec![], points, chromas: colours };
+    let template = Template {
+        crop_from_object,
+        camera: *frames.1.camera(),
+        cells,
+        features: vec![],
+        points,
+        chromas: colours,
+    };
     Some((template, input))
+}
+
+/// The object rendered from one side by a camera `away` metres from its centre, in a square image of `side` pixels, which is
+/// `factor` times as large as the object's box; `frames` are buffers, the second one with the camera of the result. `None` for a side from
+/// which nothing is visible.
+pub(crate) fn side_view(
+    (wide, close): &mut (VisibilityBuffer, VisibilityBuffer),
+    mesh: &Mesh,
+    rotation: &UnitQuaternion<f64>,
+    away: f64,
+    factor: f64,
+    side: usize,
+) -> Option<(Pose, Rendered)> {
+    let (low, high) = mesh.bounding_box();
+    let pose = Pose::new(*rotation, Vec3::new(0.0, 0.0, away) - rotation * ((low + high) * 0.5));
+    wide.render(&[SceneObject { mesh, camera_from_object: pose }], &RenderOptions::default());
+    let bbox: Rect = wide.bounding_box()?;
+    let crop = Crop::of_box(wide.camera(), &bbox, factor, side)?;
+    close.set_camera(&crop.camera);
+    let crop_from_object = crop.to_crop(&pose);
+    let rendered = render(close, mesh, &crop_from_object, None);
+    Some((crop_from_object, rendered))
 }
 
 /// The features of some cells.
