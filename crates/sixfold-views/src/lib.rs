@@ -3,6 +3,8 @@
 //!
 //! Without a region, a detector of any object proposes some, and the templates choose among them (`search`).
 //!
+//! Objects with something printed on them are also found without a region by keypoints (`sift`, `printed`).
+//!
 //! A region is resampled as seen by a camera aimed at its centre (`crop`). Its features (`features`) are compared with those of all
 //! `templates`; the best of these give correspondences, the correspondences give poses by PnP, and each pose is rendered, compared
 //! and moved (`estimate`). The network (`network`) is XFeat's backbone (Potje et al. 2024), trained further on synthetic objects
