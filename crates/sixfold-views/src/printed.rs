@@ -50,8 +50,6 @@ const STRETCH: f64 = 0.5;
 const FEWEST: usize = 7;
 /// Maximum number of poses that are made precise.
 const PRECISE: usize = 16;
-/// A keypoint agrees with a refined pose within this many inlier thresholds.
-const AGREE: f64 = 1.0;
 /// Inlier threshold relative to the projected diameter, and its range in pixels.
 const THRESHOLD: (f64, [f64; 2]) = (0.015, [2.0, 6.0]);
 
@@ -229,7 +227,7 @@ impl PrintMatches {
 
     /// Number of the image's keypoints that agree with a pose.
     pub(crate) fn agreeing(&self, pose: &Pose) -> usize {
-        distinct(self.voters(pose, AGREE * self.threshold(pose)))
+        distinct(self.voters(pose, self.threshold(pose)))
     }
 
     /// Whether two poses are so far apart that one does not become the other.
@@ -421,7 +419,7 @@ mod tests {
         let printed = Printed::of_mesh(&mesh, mesh.diameter());
         assert_eq!(printed.views.len(), VIEWS);
         let camera = Camera::new(700.0, 700.0, 319.5, 239.5, 640, 480).unwrap();
-        // Turned upside down, near a corner of the image, seen from a direction between those of the views.
+        // Rotated upside down, near a corner of the image, seen from a direction between those of the views.
         let truth =
             Pose::exp(&[0.0, 0.0, 0.0, 0.9, -0.7, 2.6].into()).with_translation(Vec3::new(0.12, -0.08, 0.5));
         let seen = ImageKeypoints::new(keypoints(&photograph(&mesh, &truth, &camera), PER_IMAGE));
@@ -431,11 +429,11 @@ mod tests {
         let pose = best.camera_from_object;
         assert!(pose.distance_to(&truth) < 0.01 && pose.rotation_angle_to(&truth) < 0.05, "{pose:?}");
         assert!(best.inliers > 2 * FEWEST, "{}", best.inliers);
-        // Keypoints agree with the right pose, and not with one that is turned by a quarter or beside it.
-        let turned = truth * Pose::exp(&[0.0, 0.0, 0.0, 0.0, 0.0, 1.57].into());
+        // Keypoints agree with the right pose, and not with one that is rotated by 90 degrees or beside it.
+        let rotated = truth * Pose::exp(&[0.0, 0.0, 0.0, 0.0, 0.0, 1.57].into());
         let beside = truth.with_translation(truth.translation() + Vec3::new(0.04, 0.0, 0.0));
-        let [right, turned, beside] = [truth, turned, beside].map(|pose| matches.agreeing(&pose));
-        assert!(right > 2 * FEWEST && turned == 0 && beside == 0, "{right} {turned} {beside}");
+        let [right, rotated, beside] = [truth, rotated, beside].map(|pose| matches.agreeing(&pose));
+        assert!(right > 2 * FEWEST && rotated == 0 && beside == 0, "{right} {rotated} {beside}");
         // Only what is in a box is used.
         let elsewhere = seen.within(&Rect { x: 0.0, y: 300.0, width: 200.0, height: 180.0 });
         assert!(printed.matches(&elsewhere, &camera).poses().is_empty());

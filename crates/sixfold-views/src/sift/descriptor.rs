@@ -63,8 +63,8 @@ pub(super) fn descriptor(level: &Plane, at: &Extremum, orientation: f32) -> [f32
             return;
         }
         let weight = (-(u * u + v * v) / (2.0 * half * half)).exp() * gx.hypot(gy);
-        let turn = (gy.atan2(gx) - orientation).rem_euclid(TAU) / TAU * ORIENTATIONS as f32;
-        shared(&mut bins, [u + half - 0.5, v + half - 0.5, turn], weight);
+        let angle = (gy.atan2(gx) - orientation).rem_euclid(TAU) / TAU * ORIENTATIONS as f32;
+        shared(&mut bins, [u + half - 0.5, v + half - 0.5, angle], weight);
     });
     let unit = |bins: &mut [f32; LENGTH]| {
         let length = bins.iter().map(|b| b * b).sum::<f32>().sqrt().max(1e-12);
@@ -77,8 +77,8 @@ pub(super) fn descriptor(level: &Plane, at: &Extremum, orientation: f32) -> [f32
 }
 
 /// Adds a weight to the bins around a position: columns, rows and orientations, trilinear.
-fn shared(bins: &mut [f32; LENGTH], [x, y, turn]: [f32; 3], weight: f32) {
-    let (x0, y0, t0) = (x.floor(), y.floor(), turn.floor());
+fn shared(bins: &mut [f32; LENGTH], [x, y, angle]: [f32; 3], weight: f32) {
+    let (x0, y0, t0) = (x.floor(), y.floor(), angle.floor());
     for (row, wy) in [(y0, 1.0 - (y - y0)), (y0 + 1.0, y - y0)] {
         if row < 0.0 || row >= CELLS as f32 {
             continue;
@@ -89,8 +89,8 @@ fn shared(bins: &mut [f32; LENGTH], [x, y, turn]: [f32; 3], weight: f32) {
             }
             let first = (row as usize * CELLS + column as usize) * ORIENTATIONS;
             let t = t0 as usize;
-            bins[first + t % ORIENTATIONS] += weight * wy * wx * (1.0 - (turn - t0));
-            bins[first + (t + 1) % ORIENTATIONS] += weight * wy * wx * (turn - t0);
+            bins[first + t % ORIENTATIONS] += weight * wy * wx * (1.0 - (angle - t0));
+            bins[first + (t + 1) % ORIENTATIONS] += weight * wy * wx * (angle - t0);
         }
     }
 }

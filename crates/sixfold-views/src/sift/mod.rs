@@ -1,5 +1,5 @@
 //! SIFT keypoints (Lowe 2004, "Distinctive Image Features from Scale-Invariant Keypoints"): blobs of an image with position, size,
-//! orientation and a descriptor that none of these changes. They recognise what is printed on an object, however large and turned.
+//! orientation and a descriptor that none of these changes. They recognise what is printed on an object, at any size and rotation.
 
 mod descriptor;
 mod extrema;
@@ -94,17 +94,17 @@ mod tests {
     }
 
     #[test]
-    fn keypoints_of_a_turned_image_are_the_same_ones_turned() {
+    fn keypoints_of_a_rotated_image_are_the_same_ones_rotated() {
         let image = texture(160, 120);
-        // A quarter turn: x of the turned image is y of this one, from the other side.
-        let turned = RgbImage::from_fn(120, 160, |x, y| *image.get(y, 119 - x).unwrap());
-        let (a, b) = (keypoints(&image, 60), keypoints(&turned, 120));
+        // Rotated by 90 degrees: x of the rotated image is y of this one, from the other side.
+        let rotated = RgbImage::from_fn(120, 160, |x, y| *image.get(y, 119 - x).unwrap());
+        let (a, b) = (keypoints(&image, 60), keypoints(&rotated, 120));
         assert!(a.len() >= 40, "{}", a.len());
         let right = a.iter().filter(|k| {
             let found = best(k, &b);
             let there = Vec2::new(119.0 - k.position.y, k.position.x);
-            let turn = (found.orientation - k.orientation - FRAC_PI_2).rem_euclid(TAU);
-            (found.position - there).norm() < 1.0 && turn.min(TAU - turn) < 0.1
+            let angle = (found.orientation - k.orientation - FRAC_PI_2).rem_euclid(TAU);
+            (found.position - there).norm() < 1.0 && angle.min(TAU - angle) < 0.1
         });
         let right = right.count();
         assert!(right * 10 >= a.len() * 9, "{right} of {}", a.len());
