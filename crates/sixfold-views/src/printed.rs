@@ -440,6 +440,36 @@ mod tests {
     }
 
     #[test]
+    fn a_match_predicts_the_pose_whatever_the_rotation_in_the_image() {
+        let mesh = printed_box();
+        let printed = Printed::of_mesh(&mesh, mesh.diameter());
+        let camera = Camera::new(700.0, 700.0, 319.5, 239.5, 640, 480).unwrap();
+        for roll in [0.0, 1.5, 4.0] {
+            let tilted = Pose::exp(&[0.0, 0.0, 0.0, 0.9, -0.7, 0.0].into());
+            let rolled = Pose::exp(&[0.0, 0.0, 0.0, 0.0, 0.0, roll].into()) * tilted;
+            let truth = rolled.with_translation(Vec3::new(0.03, -0.02, 0.5));
+            let seen = ImageKeypoints::new(keypoints(&photograph(&mesh, &truth, &camera), PER_IMAGE));
+            let matches = printed.matches(&seen, &camera).list;
+            // Those whose keypoint shows the same point of the object.
+            let right: Vec<&Match> = matches
+                .iter()
+                .filter(|m| {
+                    let at = camera.project(&truth.transform_point(&m.point));
+                    at.is_some_and(|p| (p - m.pixel).norm() < 3.0)
+                })
+                .collect();
+            let near = |m: &&&Match| {
+                m.pose.rotation_angle_to(&truth) < ANGLE
+                    && m.pose.distance_to(&truth) < 0.2 * truth.translation().z
+            };
+            let predicted = right.iter().filter(near).count();
+            assert!(right.len() >= 20, "{roll}: {}", right.len());
+            // Views from far beside predict their own direction; with a wrong rotation no match predicts the pose.
+            assert!(predicted * 10 >= right.len(), "{roll}: {predicted} of {}", right.len());
+        }
+    }
+
+    #[test]
     fn an_object_without_colours_has_no_print_and_an_empty_image_no_poses() {
         let mesh = printed_box();
         let grey = Mesh::new(mesh.vertices().to_vec(), mesh.faces().to_vec()).unwrap();
