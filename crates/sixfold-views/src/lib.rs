@@ -7,7 +7,7 @@
 //!
 //! A region is resampled as seen by a camera aimed at its centre (`crop`). Its features (`features`) are compared with those of all
 //! `templates`; the best of these give correspondences, the correspondences give poses by PnP, and each pose is rendered, compared
-//! and moved (`estimate`). The network (`network`) is XFeat's backbone (Potje et al. 2024), trained further on synthetic objects
+//! and moved (`estimate`). At the end the render itself is aligned with the image (`direct`). The network (`network`) is XFeat's backbone (Potje et al. 2024), trained further on synthetic objects
 //! (`training`).
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
@@ -15,6 +15,7 @@
 
 mod colour;
 mod crop;
+mod direct;
 mod error;
 mod estimate;
 pub mod estimator;

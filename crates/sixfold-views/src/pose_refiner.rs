@@ -70,7 +70,8 @@ impl RefinedObject for Refined {
             refiner: Some(&self.by.refiner),
             options: &self.by.options,
         };
-        let start = Hypothesis { camera_from_object: *camera_from_object, similarity: 0.0, inliers: 0 };
+        let start =
+            Hypothesis { camera_from_object: *camera_from_object, similarity: 0.0, inliers: 0, drawn: 0.0 };
         let refined = views.closer(start, image, camera, &bbox).map_err(EstimatorError::method)?;
         let (camera_from_object, agreement) = (refined.camera_from_object, refined.similarity);
         Ok((agreement > 0.0).then_some(RefinedPose { camera_from_object, agreement }))

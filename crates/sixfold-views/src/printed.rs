@@ -253,6 +253,7 @@ impl PrintMatches {
             camera_from_object: pose,
             similarity: 0.0,
             inliers: agree,
+            drawn: 0.0,
         })
     }
 
@@ -364,14 +365,21 @@ fn on_object(rendered: &Rendered, keypoint: &Keypoint) -> Option<Vec3> {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
     use sixfold_render::{Light, Material, RenderOptions, SceneObject, shade};
 
     /// A box of 100 x 60 x 40 mm with random patches of colour on its sides.
-    fn printed_box() -> Mesh {
+    pub(crate) fn printed_box() -> Mesh {
+        printed_box_with(|_, _| true)
+    }
+
+    /// The box; `drawn` says for each axis and side whether new colours are drawn. Otherwise it repeats those of the side before, turned
+    /// by half about the box's first axis.
+    pub(crate) fn printed_box_with(drawn: impl Fn(usize, f64) -> bool) -> Mesh {
         let half = Vec3::new(0.05, 0.03, 0.02);
         let (mut vertices, mut faces, mut colors) = (vec![], vec![], vec![]);
+        let mut print: Vec<[u8; 3]> = vec![];
         let mut state = 12_345u32;
         let mut random = move || {
             state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
@@ -381,8 +389,16 @@ mod tests {
             let (u, v) = ((axis + 1) % 3, (axis + 2) % 3);
             for side in [-1.0, 1.0] {
                 let n = 18;
-                for k in 0..n * n {
-                    let color = [random(), random(), random()];
+                if drawn(axis, side) {
+                    print = (0..n * n).map(|_| [random(), random(), random()]).collect();
+                } else {
+                    // The half turn keeps the first axis and reverses both others.
+                    let flip = |k: usize| {
+                        if u == 0 { (n - 1 - k / n) * n + k % n } else { k / n * n + n - 1 - k % n }
+                    };
+                    print = (0..n * n).map(|k| print[flip(k)]).collect();
+                }
+                for (k, color) in print.iter().enumerate() {
                     let first = vertices.len() as u32;
                     for (i, j) in [(0, 0), (1, 0), (1, 1), (0, 1)] {
                         let at = |cell: usize| 2.0 * cell as f64 / n as f64 - 1.0;
@@ -391,7 +407,7 @@ mod tests {
                         p[u] = at(k % n + i) * half[u];
                         p[v] = at(k / n + j) * half[v];
                         vertices.push(p);
-                        colors.push(color);
+                        colors.push(*color);
                     }
                     let [a, b] = if side > 0.0 { [1, 2] } else { [2, 1] };
                     faces.push([first, first + a, first + b]);
@@ -404,7 +420,7 @@ mod tests {
     }
 
     /// An image of the box in front of grey.
-    fn photograph(mesh: &Mesh, pose: &Pose, camera: &Camera) -> RgbImage {
+    pub(crate) fn photograph(mesh: &Mesh, pose: &Pose, camera: &Camera) -> RgbImage {
         let mut frame = VisibilityBuffer::new(camera);
         let objects = [SceneObject { mesh, camera_from_object: *pose }];
         frame.render(&objects, &RenderOptions::default());

@@ -116,11 +116,16 @@ pub(crate) struct Photograph {
 }
 
 /// The box around which a photograph is cropped.
-pub(crate) struct Framing {
-    /// Whether it is the box of the whole object; otherwise that of the visible part.
-    pub(crate) whole: bool,
-    /// Range of the scale factor of that box.
-    pub(crate) scale: [f64; 2],
+pub(crate) enum Framing {
+    /// That of the whole object or of its visible part, shifted a little.
+    Around {
+        /// Whether it is the box of the whole object; otherwise that of the visible part.
+        whole: bool,
+        /// Range of the scale factor of that box.
+        scale: [f64; 2],
+    },
+    /// A box in the image of [`wide_camera`].
+    Box(Rect),
 }
 
 pub(crate) fn photograph(
@@ -158,15 +163,17 @@ pub(crate) fn photograph(
     if corners[0] > corners[2] {
         return None;
     }
-    let [x0, y0, x1, y1] = corners.map(|v| v as f64);
-    let seen = [x0, y0, x1 - x0 + 1.0, y1 - y0 + 1.0];
-    let [x0, y0, w, h] = if framing.whole { [x, y, w, h].map(f64::from) } else { seen };
-    let jitter = |random: &mut Random| between(random, -0.07, 0.07) * w.max(h);
-    let bbox = Rect { x: x0 + jitter(random), y: y0 + jitter(random), width: w, height: h }.scaled(between(
-        random,
-        framing.scale[0],
-        framing.scale[1],
-    ));
+    let bbox = match framing {
+        Framing::Box(bbox) => *bbox,
+        Framing::Around { whole, scale } => {
+            let [x0, y0, x1, y1] = corners.map(|v| v as f64);
+            let seen = [x0, y0, x1 - x0 + 1.0, y1 - y0 + 1.0];
+            let [x0, y0, w, h] = if *whole { [x, y, w, h].map(f64::from) } else { seen };
+            let jitter = |random: &mut Random| between(random, -0.07, 0.07) * w.max(h);
+            let moved = Rect { x: x0 + jitter(random), y: y0 + jitter(random), width: w, height: h };
+            moved.scaled(between(random, scale[0], scale[1]))
+        }
+    };
     let crop = Crop::of_box(&wide, &bbox, CROP_FACTOR, side)?;
     let pose = crop.to_crop(pose);
     let mut frame = VisibilityBuffer::new(&crop.camera);
@@ -209,7 +216,7 @@ fn attempt(textures: &Backgrounds, side: usize, random: &mut Random) -> Option<S
     let rotation = random_rotation(random).rotation();
     let range = diameter * between(random, 4.0, 9.0);
     let shift = Vec3::new(between(random, -0.05, 0.05), between(random, -0.05, 0.05), 1.0) * range;
-    let framing = Framing { whole: false, scale: [0.9, 1.15] };
+    let framing = Framing::Around { whole: false, scale: [0.9, 1.15] };
     let photograph = photograph(&mesh, &Pose::new(rotation, shift), textures, side, &framing, random)?;
     // Most meshes of users have colours, some do not.
     let bare = (random.random::<f32>() < 0.15)

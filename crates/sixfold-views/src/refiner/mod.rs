@@ -258,7 +258,7 @@ mod tests {
     use crate::crop::Crop;
     use crate::estimate::tests::cuboid;
     use crate::network::input;
-    use crate::refiner::samples::{RENDERS, make_sample};
+    use crate::refiner::samples::{Kind, RENDERS, make_sample};
     use crate::templates::wide_camera;
     use sixfold_geometry::Rect;
     use sixfold_geometry::nalgebra::UnitQuaternion;
@@ -338,9 +338,9 @@ mod tests {
     #[test]
     fn the_true_displacements_lead_to_the_true_pose() {
         let textures = Backgrounds::procedural();
-        let sample = make_sample(&textures, 160, 3, 1);
+        let sample = make_sample(&textures, Kind::Close, 160, 3, 1);
         assert_eq!(sample.renders.len(), RENDERS);
-        assert_eq!(sample.photograph, make_sample(&textures, 160, 3, 1).photograph);
+        assert_eq!(sample.photograph, make_sample(&textures, Kind::Close, 160, 3, 1).photograph);
         // A solid at a perturbed pose: the training targets agree with the projection.
         let mut random = stream(1, 0);
         let mesh = random_solid(&textures, &[], &mut random).scaled(0.1);

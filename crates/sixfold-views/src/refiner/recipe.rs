@@ -124,6 +124,7 @@ mod tests {
         differs(with(&|o| o.common.seed = 3), "seed");
         differs(with(&|o| o.batch = 3), "batch");
         differs(with(&|o| o.side = 96), "side");
+        differs(with(&|o| o.close_side = 96), "close_side");
         let photographs =
             RefinerRecipe { backgrounds: Some(folder.path().to_owned()), ..RefinerRecipe::default() };
         differs(photographs.clone(), "backgrounds");
@@ -145,6 +146,7 @@ mod tests {
         };
         assert_eq!(RefinerTrainingOptions::default().check(), Ok(()));
         assert_eq!(named(&|o| o.side = 100), "side");
+        assert_eq!(named(&|o| o.close_side = 100), "close_side");
         assert_eq!(named(&|o| o.batch = 0), "batch");
         assert_eq!(named(&|o| o.common.steps = 0), "steps");
     }

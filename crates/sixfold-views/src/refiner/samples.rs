@@ -4,6 +4,7 @@
 //! A sample is a function of seed and number alone.
 
 use rand::RngExt;
+use sixfold_align::outline::projected_box;
 use sixfold_geometry::nalgebra::{Unit, UnitQuaternion};
 use sixfold_geometry::random::{Random, stream};
 use sixfold_geometry::{Pose, Vec2, Vec3};
@@ -16,6 +17,7 @@ use sixfold_synth::distractors::random_rotation;
 use super::{HALF_CELL, Shown, shown};
 use crate::network::input;
 use crate::samples::{Framing, Photograph, SEEN, between, distance, object, photograph};
+use crate::templates::{CROP_FACTOR, wide_camera};
 
 /// Renders per photograph.
 pub(crate) const RENDERS: usize = 4;
@@ -25,6 +27,15 @@ const MIN_CELLS: usize = 12;
 const ANGLE: f64 = 0.5;
 const SHIFT: f64 = 2.2;
 const DISTANCE: f64 = 0.16;
+
+/// How the photograph of a sample is cropped.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Kind {
+    /// Around the box of the object or of its visible part, as a detector gives it.
+    Detected,
+    /// Around the object at a pose that is to be refined: the size of the crop does not reveal the object's distance.
+    Close,
+}
 
 /// A photograph and renders of the same object.
 pub(crate) struct RefinerSample {
@@ -69,21 +80,39 @@ fn moved(
     Pose::new(rotation, to - rotation * centre)
 }
 
-/// The poses to render: three to refine, often nearly right, and a wrong one.
+/// The poses to render in a crop around a box: three to refine, often nearly right, and a wrong one.
 fn poses(pose: &Pose, centre: &Vec3, focal: f64, random: &mut Random) -> [Pose; RENDERS] {
     std::array::from_fn(|k| {
         let size = random.random::<f64>();
         match k {
             0 => near(pose, centre, focal, size * size, random),
             1 | 2 => near(pose, centre, focal, size, random),
-            _ => {
-                let other = random_rotation(random).rotation();
-                let angle = other.angle().max(ANGLE);
-                let axis = other.axis().unwrap_or_else(Vec3::z_axis);
-                moved(pose, centre, focal, &UnitQuaternion::from_axis_angle(&axis, angle), 0.5, random)
-            }
+            _ => wrong(pose, centre, focal, random),
         }
     })
+}
+
+/// The poses to render in a crop around the object at the pose `start`: this one, one between it and the true pose, one very close
+/// to the true pose, and a wrong one.
+fn later_poses(pose: &Pose, start: &Pose, centre: &Vec3, focal: f64, random: &mut Random) -> [Pose; RENDERS] {
+    std::array::from_fn(|k| match k {
+        0 => *start,
+        1 => {
+            let part = random.random::<f64>();
+            let rotation = pose.rotation().slerp(&start.rotation(), part);
+            let at = pose.transform_point(centre).lerp(&start.transform_point(centre), part);
+            near(&Pose::new(rotation, at - rotation * centre), centre, focal, 0.2, random)
+        }
+        2 => near(pose, centre, focal, 0.2, random),
+        _ => wrong(pose, centre, focal, random),
+    })
+}
+
+fn wrong(pose: &Pose, centre: &Vec3, focal: f64, random: &mut Random) -> Pose {
+    let other = random_rotation(random).rotation();
+    let angle = other.angle().max(ANGLE);
+    let axis = other.axis().unwrap_or_else(Vec3::z_axis);
+    moved(pose, centre, focal, &UnitQuaternion::from_axis_angle(&axis, angle), 0.5, random)
 }
 
 fn target(shown: Shown, photograph: &Photograph, diameter: f32) -> Target {
@@ -116,23 +145,40 @@ pub(crate) fn cell_centre(cell: usize, cells: usize) -> Vec2 {
     Vec2::new((cell % cells * CELL + HALF_CELL) as f64, (cell / cells * CELL + HALF_CELL) as f64)
 }
 
-fn attempt(textures: &Backgrounds, side: usize, random: &mut Random) -> Option<RefinerSample> {
+fn attempt(textures: &Backgrounds, kind: Kind, side: usize, random: &mut Random) -> Option<RefinerSample> {
     let mesh = object(textures, random)?;
     let diameter = mesh.diameter();
     let rotation = random_rotation(random).rotation();
     let range = diameter * between(random, 4.0, 9.0);
     let shift = Vec3::new(between(random, -0.05, 0.05), between(random, -0.05, 0.05), 1.0) * range;
-    let framing = Framing { whole: random.random::<f32>() < 0.5, scale: [0.85, 1.3] };
-    let photograph = photograph(&mesh, &Pose::new(rotation, shift), textures, side, &framing, random)?;
+    let pose = Pose::new(rotation, shift);
+    let (low, high) = mesh.bounding_box();
+    let centre = (low + high) * 0.5;
+    let start = (kind == Kind::Close).then(|| {
+        // Where a crop around the object has about this focal length.
+        let focal = side as f64 / CROP_FACTOR * range / diameter;
+        near(&pose, &centre, focal, 0.7 * random.random::<f64>(), random)
+    });
+    let framing = match &start {
+        Some(start) => Framing::Box(projected_box(&mesh, &wide_camera(), start)?),
+        None => Framing::Around { whole: random.random::<f32>() < 0.5, scale: [0.8, 1.25] },
+    };
+    let photograph = photograph(&mesh, &pose, textures, side, &framing, random)?;
     let bare = (random.random::<f32>() < 0.15)
         .then(|| Mesh::new(mesh.vertices().to_vec(), mesh.faces().to_vec()).ok())
         .flatten();
     let known = bare.as_ref().unwrap_or(&mesh);
-    let (low, high) = mesh.bounding_box();
     let camera = &photograph.crop.camera;
     let mut frame = VisibilityBuffer::new(camera);
     let mut renders = Vec::with_capacity(RENDERS);
-    for pose in poses(&photograph.pose, &((low + high) * 0.5), camera.fx, random) {
+    let poses = match start {
+        Some(start) => {
+            let start = photograph.crop.to_crop(&start);
+            later_poses(&photograph.pose, &start, &centre, camera.fx, random)
+        }
+        None => poses(&photograph.pose, &centre, camera.fx, random),
+    };
+    for pose in poses {
         let shown = shown(&mut frame, known, &pose)?;
         if shown.cells.len() < MIN_CELLS {
             return None;
@@ -142,11 +188,17 @@ fn attempt(textures: &Backgrounds, side: usize, random: &mut Random) -> Option<R
     Some(RefinerSample { photograph: input(&photograph.patch.data), renders })
 }
 
-/// The sample with a number.
-pub(crate) fn make_sample(textures: &Backgrounds, side: usize, seed: u64, number: u64) -> RefinerSample {
+/// The sample with a number, in a crop of `side` pixels.
+pub(crate) fn make_sample(
+    textures: &Backgrounds,
+    kind: Kind,
+    side: usize,
+    seed: u64,
+    number: u64,
+) -> RefinerSample {
     let mut random = stream(seed, number);
     loop {
-        if let Some(sample) = attempt(textures, side, &mut random) {
+        if let Some(sample) = attempt(textures, kind, side, &mut random) {
             return sample;
         }
     }

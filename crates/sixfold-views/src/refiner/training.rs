@@ -12,7 +12,7 @@ use sixfold_synth::augment::Backgrounds;
 
 use super::network::{CELL_INPUTS, PICTURE_INPUTS, REACH, RefinerNetwork};
 use super::pair;
-use super::samples::{RENDERS, RefinerSample, make_sample};
+use super::samples::{Kind, RENDERS, RefinerSample, make_sample};
 use crate::features::Extractor;
 
 /// Logarithm of the smallest and the largest spread, cells.
@@ -28,9 +28,11 @@ pub struct RefinerTrainingOptions {
     /// Steps, learning rate, seed.
     #[serde(flatten)]
     pub common: TrainingOptions,
-    /// Side of the crops, pixels; a multiple of 32.
+    /// Side of the crops around detections, pixels; a multiple of 32.
     pub side: usize,
-    /// Photographs per step, each with four renders.
+    /// Side of the crops around poses, which every other step uses, pixels; a multiple of 32.
+    pub close_side: usize,
+    /// Photographs in a step, each with four renders; half as many in crops around poses.
     pub batch: usize,
 }
 
@@ -46,20 +48,32 @@ impl Default for RefinerTrainingOptions {
                 seed: 0,
             },
             side: 160,
+            close_side: 224,
             batch: 4,
         }
     }
 }
 
 impl RefinerTrainingOptions {
+    /// The crops of a step, their side, and their number.
+    fn crops(&self, step: u64) -> (Kind, usize, usize) {
+        if step.is_multiple_of(2) {
+            (Kind::Detected, self.side, self.batch)
+        } else {
+            (Kind::Close, self.close_side, self.batch.div_ceil(2))
+        }
+    }
+
     /// Checks every number.
     ///
     /// # Errors
     /// [`OptionError`] with the first field that is out of its range.
     pub fn check(&self) -> Result<(), OptionError> {
         self.common.check()?;
-        let fits = self.side.is_multiple_of(MULTIPLE) && (MULTIPLE..=512).contains(&self.side);
-        OptionError::unless(fits, "side", self.side, "a multiple of 32 from 32 to 512 pixels")?;
+        for (option, side) in [("side", self.side), ("close_side", self.close_side)] {
+            let fits = side.is_multiple_of(MULTIPLE) && (MULTIPLE..=512).contains(&side);
+            OptionError::unless(fits, option, side, "a multiple of 32 from 32 to 512 pixels")?;
+        }
         OptionError::unless_samples("batch", self.batch, 1, "1 or more")
     }
 }
@@ -76,6 +90,8 @@ pub struct Source {
 #[derive(Debug, Clone, Default)]
 pub struct Batch {
     pairs: usize,
+    /// Side of the crops, pixels.
+    side: usize,
     pictures: Vec<f32>,
     cells: Vec<f32>,
     /// `P x 2 x N`, cells.
@@ -95,7 +111,7 @@ impl Batch {
             .collect();
         // A network that cannot run has invalid weights; the training itself then reports the failure.
         let maps = extractor.features(&inputs, side).unwrap_or_default();
-        let mut batch = Batch::default();
+        let mut batch = Batch { side, ..Batch::default() };
         for (sample, maps) in samples.iter().zip(maps.chunks_exact(1 + RENDERS)) {
             for (render, seen) in sample.renders.iter().zip(&maps[1..]) {
                 let pair = pair(&render.shown, seen, &sample.photograph, &maps[0]);
@@ -144,7 +160,7 @@ impl RefinerTraining {
 
     /// The losses of displacement, of the nearby logit and of the same-position logit, and the mean error of displacements, cells.
     fn losses(&self, batch: Batch) -> [Tensor<1>; 4] {
-        let (pairs, side) = (batch.pairs, self.options.side);
+        let (pairs, side) = (batch.pairs, batch.side);
         let n = side / CELL;
         let tensor = |values: Vec<f32>, channels: usize, side: usize| {
             Tensor::<4>::from_data(TensorData::new(values, [pairs, channels, side, side]), &self.device)
@@ -186,11 +202,12 @@ impl Training for RefinerTraining {
     fn batches<'a>(&self, source: &'a Source) -> Batches<'a, Batch> {
         let options = self.options.clone();
         Box::new(move |step| {
+            let (kind, side, count) = options.crops(step);
             let first = step * options.batch as u64;
-            let samples: Vec<RefinerSample> = (0..options.batch as u64)
-                .map(|i| make_sample(&source.textures, options.side, options.common.seed, first + i))
+            let samples: Vec<RefinerSample> = (first..first + count as u64)
+                .map(|number| make_sample(&source.textures, kind, side, options.common.seed, number))
                 .collect();
-            Batch::of(&samples, &source.extractor, options.side)
+            Batch::of(&samples, &source.extractor, side)
         })
     }
 

@@ -31,6 +31,12 @@ pub(crate) struct TrainRefinerArguments {
     /// Objects in a step, with four poses each
     #[arg(long, value_name = "N", default_value_t = default().options.batch)]
     pub batch: usize,
+    /// Side of the crops around detections, pixels, a multiple of 32
+    #[arg(long, value_name = "PIXELS", default_value_t = default().options.side)]
+    pub side: usize,
+    /// Side of the crops around poses, pixels, a multiple of 32
+    #[arg(long, value_name = "PIXELS", default_value_t = default().options.close_side)]
+    pub close_side: usize,
     /// Seed of the samples
     #[arg(long, default_value_t = default().options.common.seed)]
     pub seed: u64,
@@ -45,6 +51,8 @@ impl TrainRefinerArguments {
         options.common.learning_rate = self.learning_rate;
         options.common.seed = self.seed;
         options.batch = self.batch;
+        options.side = self.side;
+        options.close_side = self.close_side;
         RefinerRecipe {
             backgrounds: self.backgrounds.clone(),
             options,

@@ -1,0 +1,394 @@
+//! Direct alignment of a pose: the object is rendered, small windows of the render are compared with the crop, and Gauss-Newton
+//! over all windows together moves the pose (Lucas and Kanade 1981, with the pose as the motion; windows normalised in brightness
+//! and contrast). Where the object has no edges or texture, nothing changes.
+
+use sixfold_align::outline::motion;
+use sixfold_geometry::{Camera, NormalEquations, Pose, Vec2, Vec3};
+use sixfold_mesh::Mesh;
+use sixfold_render::VisibilityBuffer;
+use sixfold_synth::augment::{Coverage, Patch};
+
+use crate::templates::render;
+
+/// From coarse to fine: standard deviation of the blur, half the side of a window, and the distance of windows, pixels.
+const LEVELS: [(f32, usize, usize); 3] = [(2.5, 8, 8), (1.4, 7, 7), (0.8, 6, 6)];
+/// Renders at each level.
+const RENDERS: usize = 2;
+/// Steps for each render.
+const STEPS: usize = 6;
+/// Contrasts below this are not amplified, of 1.
+const MIN_CONTRAST: f32 = 0.04;
+/// Smallest fraction of a window that shows the object.
+const MIN_SHOWN: f32 = 0.5;
+/// Correlation of a window and the crop below which the window has no weight.
+const UNRELATED: f32 = 0.3;
+/// Smallest variance of a residual.
+const LEAST_NOISE: f32 = 0.2;
+/// Independent measurements per pixel of a window, for residuals of unit variance.
+const INFORMATION: f64 = 0.1;
+/// Standard deviations of the pose before: pixels, fraction of the distance, radians.
+const BEFORE: [f64; 3] = [3.0, 0.04, 0.08];
+/// Smallest mean correlation of the windows with the crop before, at the coarsest level.
+const MIN_BEFORE: f32 = 0.25;
+/// The steps for a render stop when no window moves by more than this, pixels.
+const CONVERGED: f64 = 0.01;
+/// Fewest windows.
+const MIN_WINDOWS: usize = 4;
+
+/// A window of a render.
+struct Window {
+    /// Its centre, and the object's point there.
+    centre: Vec2,
+    point: Vec3,
+    /// Its pixels that show the object, from the centre.
+    offsets: Vec<[i16; 2]>,
+    /// For each channel and pixel: the normalised value and its derivatives by x and y.
+    values: Vec<[f32; 3]>,
+    /// Sum of the squared values.
+    energy: f32,
+}
+
+/// A window and the crop.
+struct Compared {
+    /// Sums of the products of the derivatives: xx, xy, yy.
+    gradients: [f32; 3],
+    /// Sums of the products of derivatives and differences: x, y.
+    sums: [f32; 2],
+    correlation: f32,
+}
+
+/// Aligns poses in one crop.
+pub(crate) struct Direct<'a> {
+    mesh: &'a Mesh,
+    camera: &'a Camera,
+    /// The crop, blurred for each level.
+    blurred: Vec<Patch>,
+    /// The object's centre.
+    centre: Vec3,
+}
+
+impl<'a> Direct<'a> {
+    pub(crate) fn new(mesh: &'a Mesh, camera: &'a Camera, crop: &Patch) -> Direct<'a> {
+        let blurred = LEVELS.map(|(sigma, ..)| {
+            let mut patch = crop.clone();
+            patch.blur(sigma);
+            patch
+        });
+        let (low, high) = mesh.bounding_box();
+        Direct { mesh, camera, blurred: blurred.to_vec(), centre: (low + high) * 0.5 }
+    }
+
+    /// The aligned pose, and the mean correlation of its windows with the crop; `None` if the crop hardly shows what is drawn on the
+    /// object.
+    pub(crate) fn run(&self, start: &Pose) -> Option<(Pose, f64)> {
+        let mut frame = VisibilityBuffer::new(self.camera);
+        let mut pose = *start;
+        let mut agreement = None;
+        for (level, crop) in LEVELS.iter().zip(&self.blurred) {
+            for _ in 0..RENDERS {
+                let windows = self.windows(&mut frame, &pose, *level);
+                if agreement.is_none() && self.agreement(&windows, crop, &pose) < MIN_BEFORE {
+                    return None;
+                }
+                for _ in 0..STEPS {
+                    let (next, moved) = self.step(&windows, crop, start, &pose)?;
+                    pose = next;
+                    if moved < CONVERGED {
+                        break;
+                    }
+                }
+                agreement = Some(self.agreement(&windows, crop, &pose));
+            }
+        }
+        Some((pose, f64::from(agreement?)))
+    }
+
+    /// Mean correlation of windows at a pose with the crop.
+    fn agreement(&self, windows: &[Window], crop: &Patch, pose: &Pose) -> f32 {
+        let correlation = |window: &Window| {
+            let pixel = self.camera.project(&pose.transform_point(&window.point))?;
+            Some(window.compared(crop, &(pixel - window.centre))?.correlation)
+        };
+        windows.iter().filter_map(correlation).sum::<f32>() / windows.len().max(1) as f32
+    }
+
+    /// The windows of the object rendered at a pose.
+    fn windows(&self, frame: &mut VisibilityBuffer, pose: &Pose, level: (f32, usize, usize)) -> Vec<Window> {
+        let (sigma, half, step) = level;
+        let rendered = render(frame, self.mesh, pose, None);
+        let side = self.camera.width;
+        let area = side * side;
+        let mut mask =
+            Coverage::from_fn(side, side, |x, y| f32::from(!rendered.coordinates[(x, y)][0].is_nan()));
+        let shown: Vec<bool> = mask.data.iter().map(|v| *v > 0.5).collect();
+        let mut image = Patch::from_rgb(&rendered.image);
+        for plane in image.planes_mut() {
+            plane.iter_mut().zip(&shown).filter(|(_, shown)| !**shown).for_each(|(v, _)| *v = 0.0);
+        }
+        image.blur(sigma);
+        mask.blur(sigma);
+        for plane in image.planes_mut() {
+            plane.iter_mut().zip(&mask.data).for_each(|(v, m)| *v /= m.max(1e-3));
+        }
+        // Pixels whose neighbours the blur does not mix with the background.
+        let inside: Vec<bool> = mask.data.iter().map(|m| *m > 0.9).collect();
+        let mut windows = Vec::new();
+        let most = (2 * half + 1).pow(2) as f32;
+        let reach = half as i64;
+        for cy in (half + 1..side.saturating_sub(half + 1)).step_by(step) {
+            for cx in (half + 1..side.saturating_sub(half + 1)).step_by(step) {
+                let point = rendered.coordinates[(cx, cy)];
+                if point[0].is_nan() {
+                    continue;
+                }
+                let mut offsets = Vec::new();
+                for dy in -reach..=reach {
+                    for dx in -reach..=reach {
+                        let at = (cy as i64 + dy) as usize * side + (cx as i64 + dx) as usize;
+                        if inside[at]
+                            && shown[at - 1]
+                            && shown[at + 1]
+                            && shown[at - side]
+                            && shown[at + side]
+                        {
+                            offsets.push([dx as i16, dy as i16]);
+                        }
+                    }
+                }
+                if (offsets.len() as f32) < MIN_SHOWN * most {
+                    continue;
+                }
+                let mut values = Vec::with_capacity(3 * offsets.len());
+                let mut energy = 0.0;
+                for plane in image.data.chunks_exact(area) {
+                    let at = |o: &[i16; 2]| {
+                        (cy as i64 + i64::from(o[1])) as usize * side + (cx as i64 + i64::from(o[0])) as usize
+                    };
+                    let (mean, scale) = normalisation(offsets.iter().map(|o| plane[at(o)]));
+                    for o in &offsets {
+                        let i = at(o);
+                        let value = (plane[i] - mean) * scale;
+                        energy += value * value;
+                        values.push([
+                            value,
+                            0.5 * scale * (plane[i + 1] - plane[i - 1]),
+                            0.5 * scale * (plane[i + side] - plane[i - side]),
+                        ]);
+                    }
+                }
+                if energy > 0.3 * offsets.len() as f32 {
+                    let centre = Vec2::new(cx as f64, cy as f64);
+                    windows.push(Window {
+                        centre,
+                        point: Vec3::from(point.map(f64::from)),
+                        offsets,
+                        values,
+                        energy,
+                    });
+                }
+            }
+        }
+        windows
+    }
+
+    /// The next pose, and the largest motion of a window, pixels.
+    fn step(&self, windows: &[Window], crop: &Patch, start: &Pose, pose: &Pose) -> Option<(Pose, f64)> {
+        let centre = pose.transform_point(&self.centre);
+        let mut equations = NormalEquations::default();
+        let mut used = Vec::new();
+        for window in windows {
+            let point = pose.transform_point(&window.point);
+            let Some(pixel) = self.camera.project(&point) else { continue };
+            let shift = pixel - window.centre;
+            let Some(compared) = window.compared(crop, &shift) else { continue };
+            let correlation = compared.correlation;
+            let related = ((correlation - UNRELATED) / (1.0 - UNRELATED)).max(0.0).powi(2);
+            let weight = related / (2.0 * (1.0 - correlation) + LEAST_NOISE);
+            if weight <= 0.0 {
+                continue;
+            }
+            // The normal equations of the shift as two independent residuals.
+            let [xx, xy, yy] = compared.gradients.map(|v| f64::from(v) + 1e-9);
+            let [bx, by] = compared.sums.map(f64::from);
+            let first = xx.sqrt();
+            let mixed = xy / first;
+            let second = (yy - mixed * mixed).max(1e-9).sqrt();
+            let [row_x, row_y] = motion(self.camera, &point, &centre);
+            let e = bx / first;
+            let weight = INFORMATION * f64::from(weight);
+            let both: [f64; 6] = std::array::from_fn(|k| first * row_x[k] + mixed * row_y[k]);
+            equations.add(&both, e, weight);
+            equations.add(&row_y.map(|v| second * v), (by - mixed * e) / second, weight);
+            used.push((point, pixel));
+        }
+        if used.len() < MIN_WINDOWS {
+            return None;
+        }
+        self.add_start(&mut equations, start, pose, &centre)?;
+        let step = equations.solve(1e-3)?;
+        let about = Pose::from_translation(centre);
+        let change = about * Pose::exp(&step) * about.inverse();
+        let next = change * *pose;
+        let t = next.translation();
+        if !(t.z > 0.01 && t.iter().all(|v| v.is_finite())) {
+            return None;
+        }
+        let moved = used.iter().filter_map(|(point, pixel)| {
+            Some((self.camera.project(&change.transform_point(point))? - pixel).norm())
+        });
+        Some((next, moved.fold(0.0, f64::max)))
+    }
+
+    /// The pose before as measurements.
+    fn add_start(
+        &self,
+        equations: &mut NormalEquations,
+        start: &Pose,
+        pose: &Pose,
+        centre: &Vec3,
+    ) -> Option<()> {
+        let before = start.transform_point(&self.centre);
+        let [pixels, depth, angle] = BEFORE;
+        let off = self.camera.project(centre)? - self.camera.project(&before)?;
+        let [row_x, row_y] = motion(self.camera, centre, centre);
+        equations.add(&row_x, off.x, pixels.powi(-2));
+        equations.add(&row_y, off.y, pixels.powi(-2));
+        let nearer = (centre.z / before.z).ln();
+        equations.add(&[0.0, 0.0, 1.0 / centre.z, 0.0, 0.0, 0.0], nearer, depth.powi(-2));
+        let turned = (pose.rotation() * start.rotation().inverse()).scaled_axis();
+        for axis in 0..3 {
+            let mut row = [0.0; 6];
+            row[3 + axis] = 1.0;
+            equations.add(&row, turned[axis], angle.powi(-2));
+        }
+        Some(())
+    }
+}
+
+/// Mean and the factor to unit variance.
+fn normalisation(values: impl Iterator<Item = f32> + Clone) -> (f32, f32) {
+    let count = values.clone().count().max(1) as f32;
+    let mean = values.clone().sum::<f32>() / count;
+    let variance = values.map(|v| (v - mean).powi(2)).sum::<f32>() / count;
+    (mean, 1.0 / variance.sqrt().max(MIN_CONTRAST))
+}
+
+impl Window {
+    /// The window and the crop at a shift; `None` if the crop does not contain it.
+    fn compared(&self, crop: &Patch, shift: &Vec2) -> Option<Compared> {
+        let side = crop.width;
+        let at = self.centre + shift;
+        let (x0, y0) = (at.x.floor(), at.y.floor());
+        let (fx, fy) = ((at.x - x0) as f32, (at.y - y0) as f32);
+        let (x0, y0) = (x0 as i64, y0 as i64);
+        let weights = [(1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy];
+        let inside = |o: &[i16; 2]| {
+            let (x, y) = (x0 + i64::from(o[0]), y0 + i64::from(o[1]));
+            x >= 0 && y >= 0 && x + 1 < side as i64 && y + 1 < side as i64
+        };
+        if !self.offsets.iter().all(inside) {
+            return None;
+        }
+        let count = self.offsets.len();
+        let mut seen = vec![0.0f32; count];
+        let (mut gradients, mut sums) = ([0.0; 3], [0.0; 2]);
+        let (mut product, mut energy) = (0.0, 0.0);
+        for (plane, values) in crop.data.chunks_exact(side * side).zip(self.values.chunks_exact(count)) {
+            for (v, o) in seen.iter_mut().zip(&self.offsets) {
+                let i = (y0 + i64::from(o[1])) as usize * side + (x0 + i64::from(o[0])) as usize;
+                *v = weights[0] * plane[i]
+                    + weights[1] * plane[i + 1]
+                    + weights[2] * plane[i + side]
+                    + weights[3] * plane[i + side + 1];
+            }
+            let (mean, scale) = normalisation(seen.iter().copied());
+            for (v, [value, dx, dy]) in seen.iter().zip(values) {
+                let v = (v - mean) * scale;
+                product += v * value;
+                energy += v * v;
+                let difference = v - value;
+                gradients[0] += dx * dx;
+                gradients[1] += dx * dy;
+                gradients[2] += dy * dy;
+                sums[0] += dx * difference;
+                sums[1] += dy * difference;
+            }
+        }
+        let correlation = product / (energy * self.energy).sqrt().max(1e-6);
+        Some(Compared { gradients, sums, correlation })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::estimate::tests::cuboid;
+    use crate::printed::tests::{photograph, printed_box};
+    use sixfold_geometry::RgbImage;
+
+    const SIDE: usize = 224;
+
+    fn camera() -> Camera {
+        let middle = 0.5 * (SIDE as f64 - 1.0);
+        Camera::new(1100.0, 1100.0, middle, middle, SIDE, SIDE).unwrap()
+    }
+
+    fn truth() -> Pose {
+        Pose::exp(&[0.0, 0.0, 0.0, 0.9, -0.7, 2.6].into()).with_translation(Vec3::new(0.005, -0.004, 0.6))
+    }
+
+    /// A crop in which the object is darker to the right, has less contrast, and is blurred; `hide` covers pixels.
+    fn crop(mesh: &Mesh, hide: impl Fn(usize, usize) -> bool) -> Patch {
+        let image = photograph(mesh, &truth(), &camera());
+        let changed = RgbImage::from_fn(SIDE, SIDE, |x, y| {
+            if hide(x, y) {
+                return [(x * 31 + y * 57) as u8; 3];
+            }
+            let gain = 0.6 - 0.3 * x as f64 / SIDE as f64;
+            image[(x, y)].map(|v| (30.0 + gain * f64::from(v)) as u8)
+        });
+        let mut patch = Patch::from_rgb(&changed);
+        patch.blur(0.8);
+        patch
+    }
+
+    /// Distance in metres and angle in degrees.
+    fn errors(pose: &Pose) -> [f64; 2] {
+        [pose.distance_to(&truth()), pose.rotation_angle_to(&truth()).to_degrees()]
+    }
+
+    /// 12 mm farther, 2 pixels aside, 3 degrees.
+    fn near() -> Pose {
+        let moved = Pose::exp(&[0.0, 0.0, 0.0, 0.03, -0.03, 0.03].into()) * truth();
+        moved.with_translation(truth().translation() * 1.02 + Vec3::new(0.001, -0.001, 0.0))
+    }
+
+    #[test]
+    fn a_printed_object_is_aligned_to_a_fraction_of_a_pixel_in_other_light() {
+        let mesh = printed_box();
+        let before = errors(&near());
+        assert!(before[0] > 0.012 && before[1] > 2.5, "{before:?}");
+        let photograph = crop(&mesh, |_, _| false);
+        let (pose, drawn) = Direct::new(&mesh, &camera(), &photograph).run(&near()).unwrap();
+        let after = errors(&pose);
+        // A millimetre of distance moves the box's border by 0.15 pixels.
+        assert!(after[0] < 0.001 && after[1] < 0.2, "{after:?}");
+        assert!(drawn > 0.8, "{drawn}");
+        let hidden = crop(&mesh, |x, _| x < SIDE / 2);
+        let (pose, less) = Direct::new(&mesh, &camera(), &hidden).run(&near()).unwrap();
+        let after = errors(&pose);
+        assert!(after[0] < 0.002 && after[1] < 0.4, "{after:?}");
+        assert!(less < drawn, "{less} {drawn}");
+    }
+
+    #[test]
+    fn without_a_common_print_there_is_no_alignment() {
+        let mesh = printed_box();
+        let nothing = crop(&mesh, |_, _| true);
+        assert_eq!(Direct::new(&mesh, &camera(), &nothing).run(&near()), None);
+        // One colour from all sides in plain light.
+        let plain = cuboid([-0.05, -0.03, -0.02], [0.05, 0.03, 0.02], [90, 90, 90]);
+        let flat = Patch::filled(SIDE, SIDE, [0.5; 3]);
+        assert_eq!(Direct::new(&plain, &camera(), &flat).run(&near()), None);
+    }
+}
