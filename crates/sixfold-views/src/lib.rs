@@ -7,12 +7,14 @@
 //!
 //! A region is resampled as seen by a camera aimed at its centre (`crop`). Its features (`features`) are compared with those of all
 //! `templates`; the best of these give correspondences, the correspondences give poses by PnP, and each pose is rendered, compared
-//! and moved (`estimate`). At the end the render itself is aligned with the image (`direct`). The network (`network`) is XFeat's backbone (Potje et al. 2024), trained further on synthetic objects
+//! and moved (`estimate`). The best are refined in a crop of higher resolution (`close`), where
+//! the render itself is aligned with the image (`direct`). The network (`network`) is XFeat's backbone (Potje et al. 2024), trained further on synthetic objects
 //! (`training`).
 
 #![deny(clippy::print_stdout, clippy::print_stderr)]
 #![warn(unreachable_pub, unnameable_types)]
 
+mod close;
 mod colour;
 mod crop;
 mod direct;
