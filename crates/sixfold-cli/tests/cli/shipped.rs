@@ -88,7 +88,7 @@ fn more_starts_agree_better_with_the_image() {
     let image = format!("--rgb {} --camera {}", demo("test/000002/rgb/000003.png"), demo("camera.json"));
     // A box that is too small for the object and not centred on it.
     let object =
-        format!("--object {} --unit mm --object-id 9 --box 360,300,60,45", demo("models/obj_000009.ply"));
+        format!("--object {} --unit mm --object-id 9 --box 370,310,60,45", demo("models/obj_000009.ply"));
     let pose = |starts: usize| {
         let estimate = format!("estimate --method pix2pose --weights {} {image} {object}", weights.display());
         let answer =
