@@ -1,4 +1,5 @@
-//! The last refinement of a pose, in a crop around the whole object at this pose: refiner, outline, and what is drawn on the object.
+//! The last refinement of a pose, in a crop around the whole object at this pose: refiner (Lipson et al. 2022), outline (Prisacariu and
+//! Reid 2012), and what is drawn on the object (Lucas and Kanade 1981). The choice between poses rotated by 180 degrees is ours.
 
 use rayon::prelude::*;
 use sixfold_align::outline::{Alignment, AlignmentOptions, Outline, log_odds, projected_box};
@@ -25,11 +26,11 @@ const DECIDED: f32 = 0.9;
 const MAX_GROWTH: f64 = 4.0;
 /// An aligned outline is kept unless the agreement of features drops by more than this; chosen by hand, not swept.
 const TOLERANCE: f64 = 0.02;
-/// A pose turned by half is refined if the image agrees with it at least this much, relative to the pose itself.
-const TURNED: f64 = 0.3;
+/// A pose rotated by 180 degrees is refined if the image agrees with it at least this much, relative to the pose itself.
+const ROTATED: f64 = 0.3;
 /// It comes before the pose if they agree with the image about equally, and it agrees better in what is drawn on the object.
-const TURNED_TOLERANCE: f64 = 0.15;
-const TURNED_DRAWN: f64 = 0.03;
+const ROTATED_TOLERANCE: f64 = 0.15;
+const ROTATED_DRAWN: f64 = 0.03;
 /// As [`TOLERANCE`], for a pose aligned directly; poses that are off by less than a pixel differ by up to this much.
 const DIRECT_TOLERANCE: f64 = 0.05;
 /// Smallest mean correlation of what is drawn on the object with the image, after alignment, at which the alignment is kept; chosen on
@@ -57,10 +58,10 @@ impl Views<'_> {
         let mut closer = all(poses)?;
         let best = closer.iter().copied().reduce(|a, b| if b.similarity > a.similarity { b } else { a });
         if let Some(best) = best.filter(|best| best.similarity > 0.0) {
-            let mut turned = all(self.turned(&best, image, camera)?)?;
-            decide(&best, &mut turned);
-            turned.append(&mut closer);
-            closer = turned;
+            let mut rotated = all(self.rotated(&best, image, camera)?)?;
+            decide(&best, &mut rotated);
+            rotated.append(&mut closer);
+            closer = rotated;
         }
         if let Some(prints) = prints {
             for hypothesis in &mut closer {
@@ -73,9 +74,9 @@ impl Views<'_> {
         Ok(closer)
     }
 
-    /// A pose turned by half about the axes of the object's bounding box, where the image could show that as well: both faces of a
+    /// A pose rotated by 180 degrees about the axes of the object's bounding box, where the image could show that as well: both faces of a
     /// box often have the same print, and then only its sides tell which one is in front.
-    fn turned(
+    fn rotated(
         &self,
         pose: &Hypothesis,
         image: &RgbImage,
@@ -88,17 +89,17 @@ impl Views<'_> {
         let Some(part) = part else { return Ok(vec![]) };
         let (low, high) = self.mesh.bounding_box();
         let centre = Pose::from_translation((low + high) * 0.5);
-        let turned = [Vec3::x_axis(), Vec3::y_axis(), Vec3::z_axis()].map(|axis| {
+        let rotated = [Vec3::x_axis(), Vec3::y_axis(), Vec3::z_axis()].map(|axis| {
             let half = UnitQuaternion::from_axis_angle(&axis, std::f64::consts::PI);
-            let turn = centre * Pose::new(half, Vec3::zeros()) * centre.inverse();
-            Hypothesis { camera_from_object: pose.camera_from_object * turn, ..*pose }
+            let half_rotation = centre * Pose::new(half, Vec3::zeros()) * centre.inverse();
+            Hypothesis { camera_from_object: pose.camera_from_object * half_rotation, ..*pose }
         });
         let mut out = Vec::new();
-        for hypothesis in turned {
+        for hypothesis in rotated {
             let crop_from_object = part.crop.to_crop(&hypothesis.camera_from_object);
             let seen =
                 self.seen_at(&Hypothesis { camera_from_object: crop_from_object, ..hypothesis }, &part)?;
-            if seen.is_some_and(|(_, similarity)| similarity > TURNED * pose.similarity)
+            if seen.is_some_and(|(_, similarity)| similarity > ROTATED * pose.similarity)
                 && let Some(bbox) = projected_box(self.outline, camera, &hypothesis.camera_from_object)
             {
                 out.push((hypothesis, bbox));
@@ -212,12 +213,12 @@ impl Views<'_> {
     }
 }
 
-/// A pose turned by half comes before the pose itself if both agree with the image about equally and it agrees better in what is drawn
+/// A pose rotated by 180 degrees comes before the pose itself if both agree with the image about equally and it agrees better in what is drawn
 /// on the object: what is drawn on the sides is little of the object, but it decides.
-fn decide(best: &Hypothesis, turned: &mut [Hypothesis]) {
-    for pose in turned {
-        let close = (best.similarity - pose.similarity).abs() < TURNED_TOLERANCE;
-        if close && pose.drawn > best.drawn + TURNED_DRAWN {
+fn decide(best: &Hypothesis, rotated: &mut [Hypothesis]) {
+    for pose in rotated {
+        let close = (best.similarity - pose.similarity).abs() < ROTATED_TOLERANCE;
+        if close && pose.drawn > best.drawn + ROTATED_DRAWN {
             pose.similarity = pose.similarity.max(best.similarity);
         }
     }
@@ -234,7 +235,7 @@ mod tests {
 
     #[test]
     fn of_two_equal_faces_the_sides_tell_which_one_is_in_front() {
-        // Turned by half about the x axis the box shows the same print, but not on the sides of that axis.
+        // Rotated by 180 degrees about the x axis the box shows the same print, but not on the sides of that axis.
         let mesh = printed_box_with(|axis, side| axis == 0 || side < 0.0);
         let extractor = Extractor::shipped().unwrap();
         let device = burn::tensor::Device::default();
@@ -254,9 +255,9 @@ mod tests {
             Pose::exp(&[0.0, 0.0, 0.0, 0.35, 0.75, 0.3].into()).with_translation(Vec3::new(0.02, 0.01, 0.5));
         let image = photograph(&mesh, &truth, &camera);
         let half = UnitQuaternion::from_axis_angle(&Vec3::x_axis(), std::f64::consts::PI);
-        let turned = truth * Pose::new(half, Vec3::zeros());
-        let bbox = projected_box(&mesh, &camera, &turned).unwrap();
-        let start = Hypothesis { camera_from_object: turned, similarity: 0.0, inliers: 0, drawn: 0.0 };
+        let rotated = truth * Pose::new(half, Vec3::zeros());
+        let bbox = projected_box(&mesh, &camera, &rotated).unwrap();
+        let start = Hypothesis { camera_from_object: rotated, similarity: 0.0, inliers: 0, drawn: 0.0 };
         let found = views.closer_all(vec![(start, bbox)], None, &image, &camera).unwrap();
         let best = found[0].camera_from_object;
         assert!(best.rotation_angle_to(&truth) < 0.01, "{}", best.rotation_angle_to(&truth));
@@ -265,7 +266,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_drawn_decides_between_turned_poses_only_if_they_agree_about_equally() {
+    fn what_is_drawn_decides_between_rotated_poses_only_if_they_agree_about_equally() {
         let of = |similarity: f64, drawn: f64| Hypothesis {
             camera_from_object: Pose::identity(),
             similarity,
@@ -273,9 +274,9 @@ mod tests {
             drawn,
         };
         let after = |pose: Hypothesis| {
-            let mut turned = [pose];
-            decide(&of(0.6, 0.3), &mut turned);
-            turned[0].similarity
+            let mut rotated = [pose];
+            decide(&of(0.6, 0.3), &mut rotated);
+            rotated[0].similarity
         };
         assert_eq!(after(of(0.5, 0.4)), 0.6);
         assert_eq!(after(of(0.5, 0.31)), 0.5);

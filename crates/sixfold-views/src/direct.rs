@@ -1,6 +1,6 @@
 //! Direct alignment of a pose: the object is rendered, small windows of the render are compared with the crop, and Gauss-Newton
 //! over all windows together moves the pose (Lucas and Kanade 1981, with the pose as the motion; windows normalised in brightness
-//! and contrast). Where the object has no edges or texture, nothing changes.
+//! and contrast): minimised is the sum over windows of w |(I(x + d(pose)) - mean) / contrast - T(x)|^2, T the normalised render. Where the object has no edges or texture, nothing changes.
 
 use sixfold_align::outline::motion;
 use sixfold_geometry::{Camera, NormalEquations, Pose, Vec2, Vec3};
@@ -32,6 +32,8 @@ const BEFORE: [f64; 3] = [3.0, 0.04, 0.08];
 const MIN_BEFORE: f32 = 0.25;
 /// The steps for a render stop when no window moves by more than this, pixels.
 const CONVERGED: f64 = 0.01;
+/// Smallest mean of the squared normalised values of a window, over all channels.
+const MIN_ENERGY: f32 = 0.3;
 /// Fewest windows.
 const MIN_WINDOWS: usize = 4;
 
@@ -117,7 +119,6 @@ impl<'a> Direct<'a> {
         let (sigma, half, step) = level;
         let rendered = render(frame, self.mesh, pose, None);
         let side = self.camera.width;
-        let area = side * side;
         let mut mask =
             Coverage::from_fn(side, side, |x, y| f32::from(!rendered.coordinates[(x, y)][0].is_nan()));
         let shown: Vec<bool> = mask.data.iter().map(|v| *v > 0.5).collect();
@@ -133,59 +134,16 @@ impl<'a> Direct<'a> {
         // Pixels whose neighbours the blur does not mix with the background.
         let inside: Vec<bool> = mask.data.iter().map(|m| *m > 0.9).collect();
         let mut windows = Vec::new();
-        let most = (2 * half + 1).pow(2) as f32;
-        let reach = half as i64;
         for cy in (half + 1..side.saturating_sub(half + 1)).step_by(step) {
             for cx in (half + 1..side.saturating_sub(half + 1)).step_by(step) {
                 let point = rendered.coordinates[(cx, cy)];
                 if point[0].is_nan() {
                     continue;
                 }
-                let mut offsets = Vec::new();
-                for dy in -reach..=reach {
-                    for dx in -reach..=reach {
-                        let at = (cy as i64 + dy) as usize * side + (cx as i64 + dx) as usize;
-                        if inside[at]
-                            && shown[at - 1]
-                            && shown[at + 1]
-                            && shown[at - side]
-                            && shown[at + side]
-                        {
-                            offsets.push([dx as i16, dy as i16]);
-                        }
-                    }
-                }
-                if (offsets.len() as f32) < MIN_SHOWN * most {
-                    continue;
-                }
-                let mut values = Vec::with_capacity(3 * offsets.len());
-                let mut energy = 0.0;
-                for plane in image.data.chunks_exact(area) {
-                    let at = |o: &[i16; 2]| {
-                        (cy as i64 + i64::from(o[1])) as usize * side + (cx as i64 + i64::from(o[0])) as usize
-                    };
-                    let (mean, scale) = normalisation(offsets.iter().map(|o| plane[at(o)]));
-                    for o in &offsets {
-                        let i = at(o);
-                        let value = (plane[i] - mean) * scale;
-                        energy += value * value;
-                        values.push([
-                            value,
-                            0.5 * scale * (plane[i + 1] - plane[i - 1]),
-                            0.5 * scale * (plane[i + side] - plane[i - side]),
-                        ]);
-                    }
-                }
-                if energy > 0.3 * offsets.len() as f32 {
-                    let centre = Vec2::new(cx as f64, cy as f64);
-                    windows.push(Window {
-                        centre,
-                        point: Vec3::from(point.map(f64::from)),
-                        offsets,
-                        values,
-                        energy,
-                    });
-                }
+                let drawn = |i: usize| {
+                    inside[i] && shown[i - 1] && shown[i + 1] && shown[i - side] && shown[i + side]
+                };
+                windows.extend(Window::new([cx, cy], point, half, &image, drawn));
             }
         }
         windows
@@ -255,11 +213,11 @@ impl<'a> Direct<'a> {
         equations.add(&row_y, off.y, pixels.powi(-2));
         let nearer = (centre.z / before.z).ln();
         equations.add(&[0.0, 0.0, 1.0 / centre.z, 0.0, 0.0, 0.0], nearer, depth.powi(-2));
-        let turned = (pose.rotation() * start.rotation().inverse()).scaled_axis();
+        let rotated = (pose.rotation() * start.rotation().inverse()).scaled_axis();
         for axis in 0..3 {
             let mut row = [0.0; 6];
             row[3 + axis] = 1.0;
-            equations.add(&row, turned[axis], angle.powi(-2));
+            equations.add(&row, rotated[axis], angle.powi(-2));
         }
         Some(())
     }
@@ -274,6 +232,49 @@ fn normalisation(values: impl Iterator<Item = f32> + Clone) -> (f32, f32) {
 }
 
 impl Window {
+    /// The window of a render around a pixel that shows `point`, with half a side of `half` pixels; `drawn` tells which pixels have
+    /// neighbours on the object. `None` if it is hardly on the object or has one colour.
+    fn new(
+        [cx, cy]: [usize; 2],
+        point: [f32; 3],
+        half: usize,
+        image: &Patch,
+        drawn: impl Fn(usize) -> bool,
+    ) -> Option<Window> {
+        let (side, reach) = (image.width, half as i16);
+        let at = |o: &[i16; 2]| {
+            (cy as i64 + i64::from(o[1])) as usize * side + (cx as i64 + i64::from(o[0])) as usize
+        };
+        let all = (-reach..=reach).flat_map(|dy| (-reach..=reach).map(move |dx| [dx, dy]));
+        let offsets: Vec<[i16; 2]> = all.filter(|o| drawn(at(o))).collect();
+        if (offsets.len() as f32) < MIN_SHOWN * (2 * half + 1).pow(2) as f32 {
+            return None;
+        }
+        let mut values = Vec::with_capacity(3 * offsets.len());
+        let mut energy = 0.0;
+        for plane in image.data.chunks_exact(side * side) {
+            let (mean, scale) = normalisation(offsets.iter().map(|o| plane[at(o)]));
+            for i in offsets.iter().map(at) {
+                let value = (plane[i] - mean) * scale;
+                energy += value * value;
+                values.push([
+                    value,
+                    0.5 * scale * (plane[i + 1] - plane[i - 1]),
+                    0.5 * scale * (plane[i + side] - plane[i - side]),
+                ]);
+            }
+        }
+        let centre = Vec2::new(cx as f64, cy as f64);
+        let point = Vec3::from(point.map(f64::from));
+        (energy > MIN_ENERGY * offsets.len() as f32).then_some(Window {
+            centre,
+            point,
+            offsets,
+            values,
+            energy,
+        })
+    }
+
     /// The window and the crop at a shift; `None` if the crop does not contain it.
     fn compared(&self, crop: &Patch, shift: &Vec2) -> Option<Compared> {
         let side = crop.width;

@@ -374,8 +374,8 @@ pub(crate) mod tests {
         printed_box_with(|_, _| true)
     }
 
-    /// The box; `drawn` says for each axis and side whether new colours are drawn. Otherwise it repeats those of the side before, turned
-    /// by half about the box's first axis.
+    /// The box; `drawn` tells for each axis and side whether new colours are drawn. Otherwise it repeats those of the side before,
+    /// rotated by 180 degrees about the box's first axis.
     pub(crate) fn printed_box_with(drawn: impl Fn(usize, f64) -> bool) -> Mesh {
         let half = Vec3::new(0.05, 0.03, 0.02);
         let (mut vertices, mut faces, mut colors) = (vec![], vec![], vec![]);
