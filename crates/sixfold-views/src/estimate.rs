@@ -59,6 +59,8 @@ pub struct ViewsOptions {
     /// Weight of the similarity of colours, relative to that of features, when proposals are compared with templates; without
     /// effect for objects without colours and in grey images.
     pub place_colour: f32,
+    /// Weight of the similarity of features trained on ImageNet, likewise.
+    pub place_recognition: f32,
     /// Number of poses by what is printed on the object that are refined in that crop, plus one for each further instance.
     pub printed: usize,
     /// Seed of RANSAC.
@@ -97,6 +99,7 @@ impl Default for ViewsOptions {
             places: 8,
             place_hypotheses: 6,
             place_colour: 0.5,
+            place_recognition: 1.0,
             printed: 6,
             seed: 0,
         }
@@ -121,6 +124,7 @@ impl ViewsOptions {
         OptionError::unless_some("places", self.places)?;
         OptionError::unless_some("place_hypotheses", self.place_hypotheses)?;
         OptionError::unless_weight("place_colour", f64::from(self.place_colour))?;
+        OptionError::unless_weight("place_recognition", f64::from(self.place_recognition))?;
         OptionError::unless_positive("reprojection", self.reprojection, "pixels above 0")
     }
 }

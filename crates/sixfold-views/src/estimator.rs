@@ -67,7 +67,7 @@ impl ViewsEstimator {
         let (network, _) = ViewNetwork::load(weights, &device)?;
         let hash = sixfold_io::fnv1a_of_file(weights)
             .map_err(|source| ViewsError::Read { file: weights.to_owned(), source })?;
-        Ok(ViewsEstimator::new(Extractor::new(network, device), hash))
+        Ok(ViewsEstimator::new(Extractor::new(network, device)?, hash))
     }
 
     fn new(extractor: Extractor, network: u64) -> ViewsEstimator {

@@ -5,6 +5,7 @@ use sixfold_nn::xfeat::{CELL, CHANNELS};
 
 use crate::error::ViewsError;
 use crate::network::{INPUTS, ViewNetwork};
+use crate::recognition::Recogniser;
 
 /// Crops per forward pass.
 const BATCH: usize = 16;
@@ -14,6 +15,7 @@ const BATCH: usize = 16;
 pub struct Extractor {
     network: ViewNetwork,
     device: Device,
+    recogniser: Recogniser,
 }
 
 /// Features of a square crop, row by row, each of length 1.
@@ -39,12 +41,20 @@ impl Extractor {
     /// [`ViewsError::Weights`].
     pub fn shipped() -> Result<Extractor, ViewsError> {
         let device = Device::default();
-        Ok(Extractor { network: ViewNetwork::shipped(&device)?, device })
+        Extractor::new(ViewNetwork::shipped(&device)?, device)
     }
 
     /// Another network, on the device of its tensors.
-    pub fn new(network: ViewNetwork, device: Device) -> Extractor {
-        Extractor { network, device }
+    ///
+    /// # Errors
+    /// [`ViewsError::Weights`].
+    pub fn new(network: ViewNetwork, device: Device) -> Result<Extractor, ViewsError> {
+        Ok(Extractor { network, device, recogniser: Recogniser::shipped()? })
+    }
+
+    /// The network by which parts of an image are recognised.
+    pub(crate) fn recogniser(&self) -> &Recogniser {
+        &self.recogniser
     }
 
     /// Features of crops of `side` x `side` pixels as returned by `crate::network::input`.

@@ -9,14 +9,16 @@ use sixfold_geometry::{Camera, Pose, Vec3};
 use sixfold_io::{fnv1a, limits, read_regular, write_atomically};
 use sixfold_nn::xfeat::CHANNELS;
 
+use crate::recognition::{self, Appearance};
 use crate::printed::{View, ViewKeypoint, from_byte, to_byte};
 use crate::sift::LENGTH;
 use crate::templates::Template;
 
 /// Magic bytes of such a file; the digit is the format's version.
-const MAGIC: &[u8; 8] = b"sfviews3";
-/// Bytes of a template without its cells: pose, focal length, side, number of cells, number of cells with a colour (all or none).
-const HEAD: usize = 8 * 8 + 3 * 4;
+const MAGIC: &[u8; 8] = b"sfviews4";
+/// Bytes of a template without its cells: pose, focal length, side, number of cells, number of cells with a colour (all or none), number of cells
+/// by which it is recognised.
+const HEAD: usize = 8 * 8 + 4 * 4;
 /// Bytes of a cell without its colour: number, feature, point.
 const PER_CELL: usize = 2 + 2 * CHANNELS + 3 * 4;
 
@@ -42,11 +44,14 @@ pub(crate) fn write(path: &Path, key: u64, templates: &[Template], printed: &[Vi
         out.extend_from_slice(&(template.camera.width as u32).to_le_bytes());
         out.extend_from_slice(&(template.cells.len() as u32).to_le_bytes());
         out.extend_from_slice(&(template.chromas.len() as u32).to_le_bytes());
+        out.extend_from_slice(&(template.appearance.cells.len() as u32).to_le_bytes());
         template.cells.iter().for_each(|c| out.extend_from_slice(&c.to_le_bytes()));
         template.features.iter().for_each(|v| out.extend_from_slice(&f16::from_f32(*v).to_le_bytes()));
         template.points.as_flattened().iter().for_each(|v| out.extend_from_slice(&v.to_le_bytes()));
-        let chromas = template.chromas.as_flattened().iter();
-        chromas.for_each(|v| out.extend_from_slice(&f16::from_f32(*v).to_le_bytes()));
+        let Appearance { cells, features } = &template.appearance;
+        cells.iter().for_each(|c| out.extend_from_slice(&c.to_le_bytes()));
+        let halves = features.iter().chain(template.chromas.as_flattened());
+        halves.for_each(|v| out.extend_from_slice(&f16::from_f32(*v).to_le_bytes()));
     }
     out.extend_from_slice(&(printed.len() as u32).to_le_bytes());
     for view in printed {
@@ -158,37 +163,45 @@ impl Reader<'_> {
         })
     }
 
+    /// Numbers of cells, each below `most`.
+    fn cells(&mut self, count: usize, most: usize) -> Option<Vec<u16>> {
+        let (cells, rest) = self.0.split_at_checked(2 * count)?;
+        self.0 = rest;
+        let (cells, _) = cells.as_chunks::<2>();
+        let cells: Vec<u16> = cells.iter().map(|c| u16::from_le_bytes(*c)).collect();
+        cells.iter().all(|c| usize::from(*c) < most).then_some(cells)
+    }
+
     fn template(&mut self) -> Option<Template> {
         let (crop_from_object, focal) = self.pose()?;
         let side = u32::from_le_bytes(self.take()?) as usize;
         let count = u32::from_le_bytes(self.take()?) as usize;
         let coloured = u32::from_le_bytes(self.take()?) as usize;
+        let recognised = u32::from_le_bytes(self.take()?) as usize;
         if count > self.0.len() / PER_CELL || side > MAX_SIDE || (coloured != 0 && coloured != count) {
             return None;
         }
         let centre = 0.5 * (side as f64 - 1.0);
         let camera = Camera::new(focal, focal, centre, centre, side, side).ok()?;
-        let cells_of_side = (side / sixfold_nn::xfeat::CELL).pow(2);
         let mut template = Template {
             crop_from_object,
             camera,
-            cells: Vec::with_capacity(count),
+            cells: Vec::new(),
             features: Vec::with_capacity(count * CHANNELS),
             points: Vec::with_capacity(count),
             chromas: Vec::with_capacity(coloured),
+            appearance: Appearance::default(),
         };
-        for _ in 0..count {
-            let cell = u16::from_le_bytes(self.take()?);
-            if usize::from(cell) >= cells_of_side {
-                return None;
-            }
-            template.cells.push(cell);
-        }
+        template.cells = self.cells(count, (side / sixfold_nn::xfeat::CELL).pow(2))?;
         for _ in 0..count * CHANNELS {
             template.features.push(self.half()?);
         }
         for _ in 0..count {
             template.points.push([self.single()?, self.single()?, self.single()?]);
+        }
+        template.appearance.cells = self.cells(recognised, (side / recognition::CELL).pow(2))?;
+        for _ in 0..recognised * recognition::CHANNELS {
+            template.appearance.features.push(self.half()?);
         }
         for _ in 0..coloured {
             template.chromas.push([self.half()?, self.half()?]);
@@ -212,6 +225,10 @@ mod tests {
             features: (0..count * CHANNELS).map(|i| (i % 16) as f32 / 16.0).collect(),
             points: (0..count).map(|i| [i as f32, 0.5, -0.25]).collect(),
             chromas: (0..count * usize::from(coloured)).map(|i| [0.25, -0.5 * i as f32]).collect(),
+            appearance: Appearance {
+                cells: (0..count as u16).collect(),
+                features: (0..count * recognition::CHANNELS).map(|i| (i % 8) as f32 / 8.0).collect(),
+            },
         }
     }
 
@@ -246,7 +263,7 @@ mod tests {
             assert!(back.crop_from_object.rotation_angle_to(&template.crop_from_object) < 1e-7);
             assert_eq!((back.camera, &back.cells), (template.camera, &template.cells));
             assert_eq!((&back.features, &back.points), (&template.features, &template.points));
-            assert_eq!(back.chromas, template.chromas);
+            assert_eq!((&back.chromas, &back.appearance), (&template.chromas, &template.appearance));
         }
         assert!(read(&file, 8).unwrap().is_none(), "of another object");
         let whole = std::fs::read(&file).unwrap();

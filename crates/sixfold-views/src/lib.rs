@@ -27,6 +27,7 @@ mod matching;
 mod network;
 mod pose_refiner;
 mod printed;
+mod recognition;
 pub mod recipe;
 pub mod refiner;
 mod samples;

@@ -59,9 +59,14 @@ pub(crate) fn quick_similarity(template: &Template, map: &FeatureMap) -> f32 {
 
 /// The cell within `reach` of `cell` whose feature is most similar, and the product.
 pub(crate) fn best_near(feature: &[f32], map: &FeatureMap, cell: usize, reach: usize) -> (usize, f32) {
-    let mut best = (cell, f32::NEG_INFINITY);
-    for at in near(map.cells, cell, reach) {
-        let product = dot(feature, map.feature(at));
+    best_of(feature, &map.features, near(map.cells, cell, reach))
+}
+
+/// That of some cells whose feature is most similar, and the product.
+pub(crate) fn best_of(feature: &[f32], map: &[f32], cells: impl Iterator<Item = usize>) -> (usize, f32) {
+    let mut best = (0, f32::NEG_INFINITY);
+    for at in cells {
+        let product = dot(feature, &map[at * feature.len()..][..feature.len()]);
         if product > best.1 {
             best = (at, product);
         }
@@ -70,7 +75,7 @@ pub(crate) fn best_near(feature: &[f32], map: &FeatureMap, cell: usize, reach: u
 }
 
 /// The cells within `reach` of a cell of a map of `n` x `n`, row by row.
-fn near(n: usize, cell: usize, reach: usize) -> impl Iterator<Item = usize> {
+pub(crate) fn near(n: usize, cell: usize, reach: usize) -> impl Iterator<Item = usize> {
     let (x, y) = (cell % n, cell / n);
     let range = move |at: usize| at.saturating_sub(reach)..(at + reach + 1).min(n);
     range(y).flat_map(move |v| range(x).map(move |u| v * n + u))
@@ -134,6 +139,7 @@ mod tests {
             features: of.iter().flat_map(|c| map().feature(*c).to_vec()).collect(),
             points: vec![[0.0; 3]; at.len()],
             chromas: vec![],
+            appearance: Default::default(),
         }
     }
 

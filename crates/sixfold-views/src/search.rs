@@ -16,6 +16,7 @@ use crate::estimate::{Hypothesis, Part, Views};
 use crate::features::Extractor;
 use crate::matching::{colour_similarity, quick_similarity};
 use crate::printed::ImageKeypoints;
+use crate::recognition::Recognised;
 use crate::templates::Template;
 
 /// Boxes of two poses that overlap more than this (intersection over union) belong to one instance.
@@ -26,11 +27,18 @@ pub(crate) struct Place {
     bbox: Rect,
     part: Part,
     chromas: Option<Vec<Chroma>>,
+    recognised: Option<Recognised>,
 }
 
 impl Place {
-    fn new(bbox: Rect, part: Part) -> Place {
-        Place { bbox, chromas: part.chromas(), part }
+    fn new(extractor: &Extractor, bbox: Rect, part: Part) -> Result<Place, ViewsError> {
+        let recognised = extractor.recogniser().features(&[&part.patch.data], part.patch.width)?.pop();
+        Ok(Place { bbox, chromas: part.chromas(), recognised, part })
+    }
+
+    /// Similarity of what it shows to a template, 0 to 1.
+    fn recognised_as(&self, template: &Template) -> f32 {
+        self.recognised.as_ref().map_or(0.0, |seen| template.appearance.similarity(seen))
     }
 
     /// Similarity of its colours to a template's, 0 to 1; 0 if either has none.
@@ -62,7 +70,7 @@ impl Places {
         detected.truncate(most);
         let place = |bbox: Rect| -> Result<Option<Place>, ViewsError> {
             let part = Part::new(extractor, image, camera, &bbox, side)?;
-            Ok(part.map(|part| Place::new(bbox, part)))
+            part.map(|part| Place::new(extractor, bbox, part)).transpose()
         };
         let places: Result<Vec<Option<Place>>, ViewsError> =
             detected.par_iter().map(|d| place(d.region.bbox)).collect();
@@ -116,7 +124,11 @@ impl Views<'_> {
     /// Similarity of a crop to its most similar template, on a subset of features: selects the places to examine further.
     fn max_similarity(&self, place: &Place) -> f32 {
         let weight = self.options.place_colour;
-        let of = |template| quick_similarity(template, &place.part.map) + weight * place.colour_of(template);
+        let of = |template| {
+            quick_similarity(template, &place.part.map)
+                + weight * place.colour_of(template)
+                + self.options.place_recognition * place.recognised_as(template)
+        };
         self.templates.par_iter().map(of).reduce(|| f32::NEG_INFINITY, f32::max)
     }
 
@@ -149,7 +161,8 @@ mod tests {
         let templates = make_templates(&mesh, "part", mesh.diameter(), &extractor, &few).unwrap();
         let options = ViewsOptions::default();
         let place = |image: &RgbImage| {
-            Place::new(bbox, Part::new(&extractor, image, &camera, &bbox, options.side).unwrap().unwrap())
+            let part = Part::new(&extractor, image, &camera, &bbox, options.side).unwrap().unwrap();
+            Place::new(&extractor, bbox, part).unwrap()
         };
         let best = |place: &Place| templates.iter().map(|t| place.colour_of(t)).fold(0.0, f32::max);
         let [own, other, none] = [&image, &swapped, &grey].map(|image| best(&place(image)));

@@ -16,6 +16,7 @@ use crate::crop::Crop;
 use crate::error::ViewsError;
 use crate::features::{Extractor, FeatureMap};
 use crate::network::input;
+use crate::recognition::Appearance;
 
 /// One view of an object.
 #[derive(Debug, Clone)]
@@ -32,6 +33,8 @@ pub(crate) struct Template {
     pub points: Vec<[f32; 3]>,
     /// Their colours; none if the object has no colours.
     pub chromas: Vec<Chroma>,
+    /// By which the object is recognised.
+    pub appearance: Appearance,
 }
 
 impl Template {
@@ -47,6 +50,13 @@ pub(crate) struct Rendered {
     pub image: RgbImage,
     /// The visible points in the object's frame; NaN where there are none.
     pub coordinates: sixfold_geometry::PointImage,
+}
+
+impl Rendered {
+    /// Whether a pixel, by its number, shows the object.
+    fn shows(&self, pixel: usize) -> bool {
+        !self.coordinates.as_slice()[pixel][0].is_nan()
+    }
 }
 
 /// The lamp for templates: at the camera.
@@ -96,6 +106,11 @@ const CONTRAST: f32 = 0.4;
 
 /// The network's input for a render in front of plain grey that contrasts with the object.
 pub(crate) fn input_over_grey(rendered: &Rendered) -> Vec<f32> {
+    input(&over_grey(rendered))
+}
+
+/// The colour planes of a render in front of plain grey that contrasts with the object.
+fn over_grey(rendered: &Rendered) -> Vec<f32> {
     let mut planes = Patch::from_rgb(&rendered.image).data;
     let area = planes.len() / 3;
     let hidden: Vec<bool> = rendered.coordinates.as_slice().iter().map(|p| p[0].is_nan()).collect();
@@ -111,7 +126,7 @@ pub(crate) fn input_over_grey(rendered: &Rendered) -> Vec<f32> {
     for plane in planes.chunks_exact_mut(area.max(1)) {
         plane.iter_mut().zip(&hidden).filter(|(_, hidden)| **hidden).for_each(|(v, _)| *v = grey);
     }
-    input(&planes)
+    planes
 }
 
 /// Ratio of a crop's side to the longer side of the object's box; the network was trained with it.
@@ -231,7 +246,7 @@ pub(crate) fn make_templates(
     let mut templates = Vec::with_capacity(sides.len());
     // Inputs are large, so they are processed in chunks.
     for chunk in sides.chunks(CHUNK) {
-        let rendered: Vec<(Template, Vec<f32>)> = chunk
+        let rendered: Vec<(Template, Rendered)> = chunk
             .par_iter()
             .map_init(
                 || (VisibilityBuffer::new(&wide), VisibilityBuffer::new(&wide)),
@@ -239,12 +254,18 @@ pub(crate) fn make_templates(
             )
             .flatten()
             .collect();
-        let (mut made, inputs): (Vec<Template>, Vec<Vec<f32>>) = rendered.into_iter().unzip();
+        let (mut made, rendered): (Vec<Template>, Vec<Rendered>) = rendered.into_iter().unzip();
+        let planes: Vec<Vec<f32>> = rendered.iter().map(over_grey).collect();
+        let inputs: Vec<Vec<f32>> = planes.iter().map(|planes| input(planes)).collect();
         let maps = extractor.features(&inputs, options.side)?;
-        for (template, map) in made.iter_mut().zip(maps) {
+        let planes: Vec<&[f32]> = planes.iter().map(Vec::as_slice).collect();
+        let recognised = extractor.recogniser().features(&planes, options.side)?;
+        for (((template, rendered), map), seen) in made.iter_mut().zip(&rendered).zip(maps).zip(recognised) {
             template.features = gathered(&map, &template.cells);
+            template.appearance = Appearance::new(&seen, |i| rendered.shows(i));
             // Rounded as in the file, so that stored and new templates give the same poses.
-            let numbers = template.features.iter_mut().chain(template.chromas.as_flattened_mut());
+            let colours = template.chromas.as_flattened_mut().iter_mut();
+            let numbers = template.features.iter_mut().chain(&mut template.appearance.features).chain(colours);
             numbers.for_each(|v| *v = f16::from_f32(*v).to_f32());
         }
         templates.append(&mut made);
@@ -258,23 +279,21 @@ pub(crate) fn make_templates(
 /// Number of templates rendered at a time, before their features are computed.
 const CHUNK: usize = 64;
 
-/// A template without features, and the network's input for these; `None` for a side from which nothing is visible.
+/// A template without features, and its render; `None` for a side from which nothing is visible.
 fn render_side(
     frames: &mut (VisibilityBuffer, VisibilityBuffer),
     mesh: &Mesh,
     rotation: &UnitQuaternion<f64>,
     diameter: f64,
     options: &TemplateOptions,
-) -> Option<(Template, Vec<f32>)> {
+) -> Option<(Template, Rendered)> {
     let away = options.distance * diameter;
     let (crop_from_object, rendered) =
         side_view(frames, mesh, rotation, away, options.crop_factor, options.side)?;
     let (cells, points) = cells_on_object(&rendered, options.side / CELL);
-    let input = input_over_grey(&rendered);
     let mut colours = Vec::new();
     if has_colours(mesh) {
-        let shown = |i: usize| !rendered.coordinates.as_slice()[i][0].is_nan();
-        let all = chromas(&Patch::from_rgb(&rendered.image).data, options.side, shown);
+        let all = chromas(&Patch::from_rgb(&rendered.image).data, options.side, |i| rendered.shows(i));
         colours = cells.iter().map(|cell| all[usize::from(*cell)]).collect();
     }
     let template = Template {
@@ -284,8 +303,9 @@ fn render_side(
         features: vec![],
         points,
         chromas: colours,
+        appearance: Appearance::default(),
     };
-    Some((template, input))
+    Some((template, rendered))
 }
 
 /// The object rendered from one side by a camera `away` metres from its centre, in a square image of `side` pixels, which is
