@@ -99,7 +99,7 @@ impl Default for ViewsOptions {
             places: 8,
             place_hypotheses: 6,
             place_colour: 0.5,
-            place_recognition: 1.0,
+            place_recognition: 2.0,
             printed: 6,
             seed: 0,
         }

@@ -129,7 +129,8 @@ impl Views<'_> {
                 + weight * place.colour_of(template)
                 + self.options.place_recognition * place.recognised_as(template)
         };
-        self.templates.par_iter().map(of).reduce(|| f32::NEG_INFINITY, f32::max)
+        let recognised = self.templates.par_iter().filter(|t| !t.appearance.cells.is_empty());
+        recognised.map(of).reduce(|| f32::NEG_INFINITY, f32::max)
     }
 
     /// Whether two poses belong to one instance: their boxes in the image overlap more than [`ONE_INSTANCE`].

@@ -33,7 +33,7 @@ pub(crate) struct Template {
     pub points: Vec<[f32; 3]>,
     /// Their colours; none if the object has no colours.
     pub chromas: Vec<Chroma>,
-    /// By which the object is recognised.
+    /// By which the object is recognised; every second rotation has none.
     pub appearance: Appearance,
 }
 
@@ -237,38 +237,47 @@ pub(crate) fn make_templates(
     extractor: &Extractor,
     options: &TemplateOptions,
 ) -> Result<Vec<Template>, ViewsError> {
-    let rolls = (0..options.rotations).map(|k| TAU * k as f64 / options.rotations as f64);
-    let sides: Vec<UnitQuaternion<f64>> = directions(options.directions)
+    let sides: Vec<(UnitQuaternion<f64>, bool)> = directions(options.directions)
         .iter()
-        .flat_map(|direction| rolls.clone().map(|roll| rotation_from(direction, roll)))
+        .flat_map(|direction| {
+            (0..options.rotations).map(|k| {
+                let roll = TAU * k as f64 / options.rotations as f64;
+                (rotation_from(direction, roll), k.is_multiple_of(2))
+            })
+        })
         .collect();
     let wide = wide_camera();
     let mut templates = Vec::with_capacity(sides.len());
     // Inputs are large, so they are processed in chunks.
     for chunk in sides.chunks(CHUNK) {
-        let rendered: Vec<(Template, Rendered)> = chunk
+        let rendered: Vec<(Template, Rendered, bool)> = chunk
             .par_iter()
             .map_init(
                 || (VisibilityBuffer::new(&wide), VisibilityBuffer::new(&wide)),
-                |frames, rotation| render_side(frames, mesh, rotation, diameter, options),
+                |frames, (rotation, recognised)| {
+                    let (template, rendered) = render_side(frames, mesh, rotation, diameter, options)?;
+                    Some((template, rendered, *recognised))
+                },
             )
             .flatten()
             .collect();
-        let (mut made, rendered): (Vec<Template>, Vec<Rendered>) = rendered.into_iter().unzip();
-        let planes: Vec<Vec<f32>> = rendered.iter().map(over_grey).collect();
+        let planes: Vec<Vec<f32>> = rendered.iter().map(|(_, rendered, _)| over_grey(rendered)).collect();
         let inputs: Vec<Vec<f32>> = planes.iter().map(|planes| input(planes)).collect();
         let maps = extractor.features(&inputs, options.side)?;
-        let planes: Vec<&[f32]> = planes.iter().map(Vec::as_slice).collect();
-        let recognised = extractor.recogniser().features(&planes, options.side)?;
-        for (((template, rendered), map), seen) in made.iter_mut().zip(&rendered).zip(maps).zip(recognised) {
+        let shown = planes.iter().zip(&rendered).filter(|(_, (.., recognised))| *recognised);
+        let shown: Vec<&[f32]> = shown.map(|(planes, _)| planes.as_slice()).collect();
+        let mut seen = extractor.recogniser().features(&shown, options.side)?.into_iter();
+        for ((mut template, rendered, recognised), map) in rendered.into_iter().zip(maps) {
             template.features = gathered(&map, &template.cells);
-            template.appearance = Appearance::new(&seen, |i| rendered.shows(i));
+            if recognised && let Some(seen) = seen.next() {
+                template.appearance = Appearance::new(&seen, |i| rendered.shows(i));
+            }
             // Rounded as in the file, so that stored and new templates give the same poses.
             let colours = template.chromas.as_flattened_mut().iter_mut();
             let numbers = template.features.iter_mut().chain(&mut template.appearance.features).chain(colours);
             numbers.for_each(|v| *v = f16::from_f32(*v).to_f32());
+            templates.push(template);
         }
-        templates.append(&mut made);
     }
     if templates.iter().all(|t| t.cells.is_empty()) {
         return Err(ViewsError::Invisible { object: name.to_owned() });
