@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-use crate::numbers::{NAMES, Numbers, OF_COLOR, OF_DEPTH, OF_OTHERS, OF_POSE};
+use crate::numbers::{NAMES, Numbers, OF_COLOR, OF_DEPTH, OF_OTHERS, OF_POSE, OF_RECOGNITION};
 use crate::regression::{Fit, LogisticModel, fit};
 
 /// Version of the file format.
@@ -93,8 +93,8 @@ impl Calibration {
             |ranges: &[std::ops::Range<usize>]| -> Vec<usize> { ranges.iter().cloned().flatten().collect() };
         let takes = [
             takes(&[OF_DEPTH, OF_OTHERS]),
-            takes(&[OF_COLOR, OF_OTHERS, OF_POSE]),
-            takes(&[OF_DEPTH, OF_COLOR, OF_OTHERS]),
+            takes(&[OF_COLOR, OF_OTHERS, OF_POSE, OF_RECOGNITION]),
+            takes(&[OF_DEPTH, OF_COLOR, OF_OTHERS, OF_RECOGNITION]),
         ];
         let model =
             |k: usize, kept: fn(Calibration) -> LogisticModel| -> Result<LogisticModel, CalibrationError> {

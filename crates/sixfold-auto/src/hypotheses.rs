@@ -3,9 +3,10 @@
 use rayon::prelude::*;
 use sixfold_align::evidence::{EvidenceCollector, Scene, Shape};
 use sixfold_align::{Evidence, VerificationOptions, Verifier, align_to_depth, refine};
-use sixfold_estimator::{Need, PoseEstimate, PoseEstimator};
+use sixfold_estimator::{EstimatorError, Need, PoseEstimate, PoseEstimator};
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_mesh::Mesh;
+use sixfold_views::Recogniser;
 
 use crate::calibration::Calibration;
 use crate::lookalikes::LookAlikes;
@@ -46,6 +47,8 @@ pub(crate) struct Pool<'a> {
     /// Rotations that depth alone cannot distinguish.
     pub look_alikes: &'a LookAlikes,
     pub calibration: &'a Calibration,
+    /// Compares poses with the colour image.
+    pub recogniser: Option<&'a Recogniser>,
     pub one_instance: bool,
     pub hypotheses: Vec<Hypothesis>,
     pub asked: usize,
@@ -53,17 +56,24 @@ pub(crate) struct Pool<'a> {
 
 impl Pool<'_> {
     /// Adds the poses that a method found, and recomputes all probabilities.
-    pub(crate) fn add(&mut self, method: &dyn PoseEstimator, found: Vec<PoseEstimate>) {
+    ///
+    /// # Errors
+    /// [`EstimatorError::Method`] if the output of the recogniser's network cannot be read.
+    pub(crate) fn add(
+        &mut self,
+        method: &dyn PoseEstimator,
+        found: Vec<PoseEstimate>,
+    ) -> Result<(), EstimatorError> {
         self.asked += 1;
         let by_depth = method.needs().depth != Need::Unused;
         let (scene, shape, diameter) = (&self.scene, &self.shape, self.diameter);
         let look_alikes = self.look_alikes;
         let options = VerificationOptions::default();
-        let judged: Vec<Option<Hypothesis>> = found
+        let judged: Result<Vec<Option<Hypothesis>>, EstimatorError> = found
             .into_par_iter()
             .map_init(EvidenceCollector::default, |collector, mut estimate| {
                 if !is_before_camera(&estimate.camera_from_object, shape.mesh, diameter) {
-                    return None;
+                    return Ok(None);
                 }
                 let mut evidence = collector.collect(scene, shape, &estimate.camera_from_object, &options);
                 if !by_depth
@@ -81,23 +91,30 @@ impl Pool<'_> {
                     (estimate.camera_from_object, evidence) = other;
                 }
                 let similarity = estimate.details.get("similarity").and_then(serde_json::Value::as_f64);
+                let recognised = match (self.recogniser, &scene.color) {
+                    (Some(recogniser), Some((image, _))) => recogniser
+                        .similarity(shape.colored, image, scene.camera, &estimate.camera_from_object)
+                        .map_err(EstimatorError::method)?,
+                    _ => None,
+                };
                 let name = method.name();
                 let distance = centre(&estimate.camera_from_object, shape.mesh).z;
-                Some(Hypothesis {
+                Ok(Some(Hypothesis {
                     method: name,
                     found_by: vec![name],
-                    numbers: of_evidence(&evidence, similarity, distance / diameter),
+                    numbers: of_evidence(&evidence, similarity, recognised, distance / diameter),
                     strength: strength(&evidence, similarity),
                     estimate,
                     evidence,
                     probability: 0.0,
-                })
+                }))
             })
             .collect();
-        for hypothesis in judged.into_iter().flatten() {
+        for hypothesis in judged?.into_iter().flatten() {
             self.join(hypothesis);
         }
         self.compare();
+        Ok(())
     }
 
     /// Adds a hypothesis, or merges it with an equal one.

@@ -11,8 +11,8 @@ use sixfold_mttm::{MttmEstimator, MttmOptions};
 use sixfold_pix2pose::model::Pix2PoseModel;
 use sixfold_pix2pose::own_weights::OwnWeights;
 use sixfold_ppf::PpfEstimator;
-use sixfold_views::ViewsRefiner;
 use sixfold_views::estimator::ViewsEstimator;
+use sixfold_views::{Recogniser, ViewsRefiner};
 
 use crate::estimator::AutoEstimator;
 
@@ -67,6 +67,7 @@ impl AutoMembers<'_> {
         }
         let mut auto = AutoEstimator::new(members).map_err(EstimatorError::method)?;
         auto.depth = self.depth;
+        auto.recogniser = Some(Arc::new(Recogniser::shipped().map_err(EstimatorError::method)?));
         Ok(auto)
     }
 }

@@ -3,7 +3,7 @@
 use sixfold_align::Evidence;
 
 /// Number of values.
-const COUNT: usize = 18;
+const COUNT: usize = 19;
 
 /// Their names, in order.
 pub const NAMES: [&str; COUNT] = [
@@ -25,12 +25,13 @@ pub const NAMES: [&str; COUNT] = [
     "gap_here",
     "gap_elsewhere",
     "distance",
+    "recognised",
 ];
 
 /// Whether a larger value makes a pose more probable: a fit with the opposite sign has learned artefacts of its scenes.
 pub(crate) const SPEAKS_FOR: [bool; COUNT] = [
     true, true, true, true, true, true, false, true, false, true, false, true, false, true, true, true, true,
-    false,
+    false, true,
 ];
 /// Numbers from the depth image.
 pub(crate) const OF_DEPTH: std::ops::Range<usize> = 0..9;
@@ -40,6 +41,9 @@ pub(crate) const OF_COLOR: std::ops::Range<usize> = 9..14;
 pub(crate) const OF_OTHERS: std::ops::Range<usize> = 14..17;
 /// The number from the pose itself.
 pub(crate) const OF_POSE: std::ops::Range<usize> = 17..18;
+
+/// The number from features that recognise things in colour images.
+pub(crate) const OF_RECOGNITION: std::ops::Range<usize> = 18..19;
 
 /// The numbers of a pose, in the order of [`NAMES`]; `None` where one is not known.
 pub type Numbers = [Option<f64>; COUNT];
@@ -51,8 +55,14 @@ const MAX_TINT: f64 = 0.15;
 
 /// The numbers from the image and the pose, without the other poses. `similarity` is the similarity that a method on colour reports for its
 /// pose. `distance` is that of the object from the camera, in diameters: without depth the error along the view axis is a few hundredths of
-/// the distance, so a small object far away is seldom within a tenth of its diameter, however well its outline fits.
-pub(crate) fn of_evidence(evidence: &Evidence, similarity: Option<f64>, distance: f64) -> Numbers {
+/// the distance, so a small object far away is seldom within a tenth of its diameter, however well its outline fits. `recognised` is how
+/// similar the colour image is to the object at the pose ([`sixfold_views::Recogniser`]).
+pub(crate) fn of_evidence(
+    evidence: &Evidence,
+    similarity: Option<f64>,
+    recognised: Option<f64>,
+    distance: f64,
+) -> Numbers {
     let mut numbers = [None; COUNT];
     if let Some(depth) = &evidence.depth {
         let score = &depth.score;
@@ -81,6 +91,7 @@ pub(crate) fn of_evidence(evidence: &Evidence, similarity: Option<f64>, distance
         ];
         numbers[OF_COLOR.start..OF_COLOR.start + values.len()].copy_from_slice(&values);
         numbers[OF_COLOR.end - 1] = similarity;
+        numbers[OF_RECOGNITION.start] = recognised;
     }
     if evidence.depth.is_none() {
         numbers[OF_POSE.start] = Some(distance.ln());
@@ -111,14 +122,15 @@ mod tests {
 
     #[test]
     fn the_distance_counts_without_depth_only() {
-        let without = of_evidence(&Evidence { depth: None, color: None, pixels: vec![] }, None, 5.0);
+        let without = of_evidence(&Evidence { depth: None, color: None, pixels: vec![] }, None, None, 5.0);
         assert_eq!(without[OF_POSE.start], Some(5.0_f64.ln()));
         let measured = sixfold_align::DepthEvidence {
             score: sixfold_align::VerificationScore::default(),
             relief: 0.5,
             on_plane: 0.0,
         };
-        let with = of_evidence(&Evidence { depth: Some(measured), color: None, pixels: vec![] }, None, 5.0);
+        let with =
+            of_evidence(&Evidence { depth: Some(measured), color: None, pixels: vec![] }, None, None, 5.0);
         assert_eq!(with[OF_POSE.start], None);
     }
 }

@@ -56,6 +56,8 @@ pub struct ViewsOptions {
     pub places: usize,
     /// As `hypotheses`, for each of these places.
     pub place_hypotheses: usize,
+    /// As `close`, for the poses of all these places together.
+    pub place_close: usize,
     /// Weight of the similarity of colours, relative to that of features, when proposals are compared with templates; without
     /// effect for objects without colours and in grey images.
     pub place_colour: f32,
@@ -98,6 +100,7 @@ impl Default for ViewsOptions {
             proposals: 200,
             places: 8,
             place_hypotheses: 6,
+            place_close: 12,
             place_colour: 0.5,
             place_recognition: 2.0,
             printed: 6,
@@ -123,6 +126,7 @@ impl ViewsOptions {
         OptionError::unless_some("proposals", self.proposals)?;
         OptionError::unless_some("places", self.places)?;
         OptionError::unless_some("place_hypotheses", self.place_hypotheses)?;
+        OptionError::unless_some("place_close", self.place_close)?;
         OptionError::unless_weight("place_colour", f64::from(self.place_colour))?;
         OptionError::unless_weight("place_recognition", f64::from(self.place_recognition))?;
         OptionError::unless_positive("reprojection", self.reprojection, "pixels above 0")

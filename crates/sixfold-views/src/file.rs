@@ -9,8 +9,8 @@ use sixfold_geometry::{Camera, Pose, Vec3};
 use sixfold_io::{fnv1a, limits, read_regular, write_atomically};
 use sixfold_nn::xfeat::CHANNELS;
 
-use crate::recognition::{self, Appearance};
 use crate::printed::{View, ViewKeypoint, from_byte, to_byte};
+use crate::recognition::{self, Appearance};
 use crate::sift::LENGTH;
 use crate::templates::Template;
 

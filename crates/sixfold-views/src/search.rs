@@ -105,13 +105,14 @@ impl Views<'_> {
         let mut chosen = Vec::new();
         for (number, pose) in pool {
             let first = !std::mem::replace(&mut seen[number], true);
-            if chosen.len() < self.options.close || (first && instances > 1) {
+            if chosen.len() < self.options.place_close || (first && instances > 1) {
                 chosen.push((pose, alike[number].0.bbox));
             }
         }
         let prints = self.prints(keypoints, camera);
         chosen.extend(self.by_print(prints.as_ref(), camera, instances));
-        let found = self.closer_all(chosen, prints.as_ref(), image, camera)?;
+        let found =
+            self.recognised(self.closer_all(chosen, prints.as_ref(), image, camera)?, image, camera)?;
         let mut kept: Vec<Hypothesis> = Vec::new();
         for hypothesis in found {
             if kept.len() < instances && kept.iter().all(|k| !self.one(camera, k, &hypothesis)) {
@@ -119,6 +120,24 @@ impl Views<'_> {
             }
         }
         Ok(kept)
+    }
+
+    /// Poses sorted by how well the image agrees with them and how similar it is to the object there, best first.
+    fn recognised(
+        &self,
+        poses: Vec<Hypothesis>,
+        image: &RgbImage,
+        camera: &Camera,
+    ) -> Result<Vec<Hypothesis>, ViewsError> {
+        let recogniser = self.extractor.recogniser();
+        let score = |pose: Hypothesis| {
+            let similar = recogniser.similarity(self.mesh, image, camera, &pose.camera_from_object)?;
+            Ok((pose.similarity * similar.unwrap_or(0.0).max(0.0), pose))
+        };
+        let scored: Result<Vec<(f64, Hypothesis)>, ViewsError> = poses.into_par_iter().map(score).collect();
+        let mut scored = scored?;
+        scored.sort_by(|a, b| b.0.total_cmp(&a.0));
+        Ok(scored.into_iter().map(|(_, pose)| pose).collect())
     }
 
     /// Similarity of a crop to its most similar template, on a subset of features: selects the places to examine further.
@@ -149,6 +168,30 @@ mod tests {
     use crate::estimate::ViewsOptions;
     use crate::estimate::tests::{part, photographed};
     use crate::templates::{TemplateOptions, make_templates};
+
+    #[test]
+    fn the_place_that_shows_the_object_is_recognised_without_colours() {
+        let camera = Camera::new(570.0, 570.0, 319.5, 239.5, 640, 480).unwrap();
+        let (image, _, bbox) = photographed(&camera);
+        let image = image.map(|rgb| [rgb[1]; 3]);
+        let extractor = Extractor::shipped().unwrap();
+        let mesh = part();
+        let few = TemplateOptions { directions: 40, rotations: 6, ..TemplateOptions::default() };
+        let templates = make_templates(&mesh, "part", mesh.diameter(), &extractor, &few).unwrap();
+        // Every second rotation is enough.
+        let with = templates.iter().filter(|t| !t.appearance.cells.is_empty()).count();
+        assert_eq!(2 * with, templates.len());
+        let most = |bbox: Rect| {
+            let part = Part::new(&extractor, &image, &camera, &bbox, 160).unwrap().unwrap();
+            let place = Place::new(&extractor, bbox, part).unwrap();
+            templates.iter().map(|t| place.recognised_as(t)).fold(0.0, f32::max)
+        };
+        let own = most(bbox);
+        for beside in [Rect { x: 40.0, y: 300.0, ..bbox }, Rect { x: 300.0, y: 20.0, ..bbox }] {
+            let other = most(beside);
+            assert!(own > other + 0.1, "{own} {other}");
+        }
+    }
 
     #[test]
     fn a_place_in_other_colours_is_less_similar() {

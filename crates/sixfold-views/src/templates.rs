@@ -54,7 +54,7 @@ pub(crate) struct Rendered {
 
 impl Rendered {
     /// Whether a pixel, by its number, shows the object.
-    fn shows(&self, pixel: usize) -> bool {
+    pub(crate) fn shows(&self, pixel: usize) -> bool {
         !self.coordinates.as_slice()[pixel][0].is_nan()
     }
 }
@@ -110,7 +110,7 @@ pub(crate) fn input_over_grey(rendered: &Rendered) -> Vec<f32> {
 }
 
 /// The colour planes of a render in front of plain grey that contrasts with the object.
-fn over_grey(rendered: &Rendered) -> Vec<f32> {
+pub(crate) fn over_grey(rendered: &Rendered) -> Vec<f32> {
     let mut planes = Patch::from_rgb(&rendered.image).data;
     let area = planes.len() / 3;
     let hidden: Vec<bool> = rendered.coordinates.as_slice().iter().map(|p| p[0].is_nan()).collect();
@@ -274,7 +274,8 @@ pub(crate) fn make_templates(
             }
             // Rounded as in the file, so that stored and new templates give the same poses.
             let colours = template.chromas.as_flattened_mut().iter_mut();
-            let numbers = template.features.iter_mut().chain(&mut template.appearance.features).chain(colours);
+            let numbers =
+                template.features.iter_mut().chain(&mut template.appearance.features).chain(colours);
             numbers.for_each(|v| *v = f16::from_f32(*v).to_f32());
             templates.push(template);
         }
