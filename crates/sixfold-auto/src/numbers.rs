@@ -133,4 +133,14 @@ mod tests {
             of_evidence(&Evidence { depth: Some(measured), color: None, pixels: vec![] }, None, None, 5.0);
         assert_eq!(with[OF_POSE.start], None);
     }
+
+    #[test]
+    fn what_is_recognised_counts_with_a_colour_image_only() {
+        let of = |color| of_evidence(&Evidence { depth: None, color, pixels: vec![] }, None, Some(0.5), 5.0);
+        let place = NAMES.iter().position(|name| *name == "recognised").unwrap();
+        let color =
+            sixfold_align::ColorEvidence { edges: 0.8, background_edges: 0.1, correlation: 0.5, tint: None };
+        assert_eq!((OF_RECOGNITION, of(Some(color))[place]), (place..place + 1, Some(0.5)));
+        assert_eq!(of(None)[place], None);
+    }
 }

@@ -1,5 +1,6 @@
 //! Search without a given region: a detector of any object proposes boxes, the object's templates select those similar to it, and
-//! poses are estimated there (the structure of CNOS, Nguyen et al. 2023, whose proposals and features come from foundation models).
+//! poses are estimated there (the structure of CNOS, Nguyen et al. 2023, whose proposals and features come from foundation models; ours
+//! are small networks). Of the poses, those at which the image is recognised as the object come first (`recognition`).
 //!
 //! Proposals and their features belong to the image: they are computed once, for all objects searched in it.
 
@@ -168,6 +169,7 @@ mod tests {
     use crate::estimate::ViewsOptions;
     use crate::estimate::tests::{part, photographed};
     use crate::templates::{TemplateOptions, make_templates};
+    use sixfold_geometry::{Pose, Vec3};
 
     #[test]
     fn the_place_that_shows_the_object_is_recognised_without_colours() {
@@ -191,6 +193,33 @@ mod tests {
             let other = most(beside);
             assert!(own > other + 0.1, "{own} {other}");
         }
+    }
+
+    #[test]
+    fn of_poses_that_agree_equally_the_one_on_the_object_comes_first() {
+        let camera = Camera::new(570.0, 570.0, 319.5, 239.5, 640, 480).unwrap();
+        let (image, truth, _) = photographed(&camera);
+        let (extractor, mesh, options) = (Extractor::shipped().unwrap(), part(), ViewsOptions::default());
+        let views = Views {
+            extractor: &extractor,
+            mesh: &mesh,
+            outline: &mesh,
+            templates: &[],
+            printed: None,
+            refiner: None,
+            options: &options,
+        };
+        let pose =
+            |camera_from_object| Hypothesis { camera_from_object, similarity: 0.6, inliers: 20, drawn: 0.0 };
+        let beside = truth.with_translation(truth.translation() + Vec3::new(-0.3, 0.1, 0.0));
+        let behind = truth.with_translation(-truth.translation());
+        let poses = [behind, beside, truth].map(pose).to_vec();
+        let sorted = views.recognised(poses, &image, &camera).unwrap();
+        assert_eq!(sorted.iter().map(|h| h.camera_from_object).collect::<Vec<_>>(), [truth, beside, behind]);
+        let similarity =
+            |pose: &Pose| extractor.recogniser().similarity(&mesh, &image, &camera, pose).unwrap();
+        assert!(similarity(&truth).unwrap() > similarity(&beside).unwrap() + 0.1);
+        assert_eq!(similarity(&behind), None);
     }
 
     #[test]
