@@ -1,7 +1,8 @@
 //! Poses of known objects from one colour image, without training for the object: the mesh is rendered from all sides, and local
 //! features of these views are matched with those of a region of the image.
 //!
-//! Without a region, a detector of any object proposes some, and the templates choose among them (`search`).
+//! Without a region, a detector of any object proposes some, and the templates choose among them (`search`), also by features trained on
+//! ImageNet (`recognition`).
 //!
 //! Objects with something printed on them are also found without a region by keypoints (`sift`, `printed`).
 //!
