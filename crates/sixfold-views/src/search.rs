@@ -183,15 +183,30 @@ mod tests {
         // Every second rotation is enough.
         let with = templates.iter().filter(|t| !t.appearance.cells.is_empty()).count();
         assert_eq!(2 * with, templates.len());
-        let most = |bbox: Rect| {
+        let place = |bbox: Rect| {
             let part = Part::new(&extractor, &image, &camera, &bbox, 160).unwrap().unwrap();
-            let place = Place::new(&extractor, bbox, part).unwrap();
-            templates.iter().map(|t| place.recognised_as(t)).fold(0.0, f32::max)
+            Place::new(&extractor, bbox, part).unwrap()
         };
-        let own = most(bbox);
+        let most = |place: &Place| templates.iter().map(|t| place.recognised_as(t)).fold(0.0, f32::max);
+        let similarity = |place_recognition: f32, place: &Place| {
+            let options = ViewsOptions { place_recognition, ..ViewsOptions::default() };
+            let views = Views {
+                extractor: &extractor,
+                mesh: &mesh,
+                outline: &mesh,
+                templates: &templates,
+                printed: None,
+                refiner: None,
+                options: &options,
+            };
+            views.max_similarity(place)
+        };
+        let own = place(bbox);
         for beside in [Rect { x: 40.0, y: 300.0, ..bbox }, Rect { x: 300.0, y: 20.0, ..bbox }] {
-            let other = most(beside);
-            assert!(own > other + 0.1, "{own} {other}");
+            let other = place(beside);
+            assert!(most(&own) > most(&other) + 0.1, "{} {}", most(&own), most(&other));
+            let gain = |weight: f32| similarity(weight, &own) - similarity(weight, &other);
+            assert!(gain(2.0) > gain(0.0) + 0.1, "{} {}", gain(2.0), gain(0.0));
         }
     }
 
