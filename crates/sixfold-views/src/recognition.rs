@@ -47,7 +47,7 @@ pub(crate) struct Recognised {
 /// Features of an object's view, each of length 1.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(crate) struct Appearance {
-    /// Cells that show mostly the object.
+    /// Cells that show mostly the object, or the one that shows most of it.
     pub cells: Vec<u16>,
     /// Their features.
     pub features: Vec<f32>,
@@ -123,15 +123,19 @@ fn of_planes(planes: &[f32], cells: usize) -> Recognised {
 }
 
 impl Appearance {
-    /// The features of a view on the cells of which more than half the pixels are `shown`.
+    /// The features of a view on the cells of which more than half the pixels are `shown`; for a thin object without such cells on the one of
+    /// which most are.
     pub(crate) fn new(map: &Recognised, shown: impl Fn(usize) -> bool) -> Appearance {
         let side = map.cells * CELL;
-        let mostly = |cell: &usize| {
+        let covered = |cell: usize| {
             let (x, y) = (cell % map.cells * CELL, cell / map.cells * CELL);
             let pixels = (y..y + CELL).flat_map(|v| (x..x + CELL).map(move |u| v * side + u));
-            2 * pixels.filter(|i| shown(*i)).count() > CELL * CELL
+            pixels.filter(|i| shown(*i)).count()
         };
-        let cells: Vec<usize> = (0..map.cells * map.cells).filter(mostly).collect();
+        let covered: Vec<usize> = (0..map.cells * map.cells).map(covered).collect();
+        let most = covered.iter().copied().max().unwrap_or(0);
+        let enough = (CELL * CELL / 2 + 1).min(most.max(1));
+        let cells: Vec<usize> = (0..covered.len()).filter(|cell| covered[*cell] >= enough).collect();
         let features = cells.iter().flat_map(|c| map.features[c * CHANNELS..][..CHANNELS].iter().copied());
         Appearance { features: features.collect(), cells: cells.iter().map(|c| *c as u16).collect() }
     }
@@ -168,6 +172,10 @@ mod tests {
         let view = columns(16);
         assert_eq!(view.features.len(), view.cells.len() * CHANNELS);
         assert_eq!(view.features[CHANNELS + 20], 1.0, "the second feature is that of cell 4");
+        // A thin object, and none.
+        let thin = Appearance::new(&map(), |i| i == 0 || i / side == 20 && (20..24).contains(&(i % side)));
+        assert_eq!(thin.cells, [5]);
+        assert_eq!(columns(0), Appearance::default());
     }
 
     #[test]
