@@ -123,7 +123,8 @@ impl Views<'_> {
         Ok(kept)
     }
 
-    /// Poses sorted by how well the image agrees with them and how similar it is to the object there, best first.
+    /// Poses that are sorted by similarity, sorted by the product of it and of how similar the image is to the object rendered there. At one
+    /// place the most similar pose decides for all, so that their order is kept: these features are too coarse for it.
     fn recognised(
         &self,
         poses: Vec<Hypothesis>,
@@ -131,12 +132,23 @@ impl Views<'_> {
         camera: &Camera,
     ) -> Result<Vec<Hypothesis>, ViewsError> {
         let recogniser = self.extractor.recogniser();
-        let score = |pose: Hypothesis| {
-            let similar = recogniser.similarity(self.mesh, image, camera, &pose.camera_from_object)?;
-            Ok((pose.similarity * similar.unwrap_or(0.0).max(0.0), pose))
+        let of = |pose: &Hypothesis| {
+            recogniser
+                .similarity(self.mesh, image, camera, &pose.camera_from_object)
+                .map(Option::unwrap_or_default)
         };
-        let scored: Result<Vec<(f64, Hypothesis)>, ViewsError> = poses.into_par_iter().map(score).collect();
-        let mut scored = scored?;
+        let similar: Result<Vec<f64>, ViewsError> = poses.par_iter().map(of).collect();
+        // The best pose of each place, with its similarity.
+        let mut places: Vec<(Hypothesis, f64)> = Vec::new();
+        let mut scored: Vec<(f64, Hypothesis)> = Vec::new();
+        for (pose, similar) in poses.into_iter().zip(similar?) {
+            let place = places.iter().find(|(best, _)| self.one(camera, best, &pose)).copied();
+            let (_, similar) = place.unwrap_or_else(|| {
+                places.push((pose, similar.max(0.0)));
+                (pose, similar.max(0.0))
+            });
+            scored.push((pose.similarity * similar, pose));
+        }
         scored.sort_by(|a, b| b.0.total_cmp(&a.0));
         Ok(scored.into_iter().map(|(_, pose)| pose).collect())
     }
@@ -231,6 +243,10 @@ mod tests {
         let poses = [behind, beside, truth].map(pose).to_vec();
         let sorted = views.recognised(poses, &image, &camera).unwrap();
         assert_eq!(sorted.iter().map(|h| h.camera_from_object).collect::<Vec<_>>(), [truth, beside, behind]);
+        // At one place the order is kept.
+        let near = truth.with_translation(truth.translation() + Vec3::new(0.02, 0.0, 0.0));
+        let sorted = views.recognised([near, truth].map(pose).to_vec(), &image, &camera).unwrap();
+        assert_eq!(sorted[0].camera_from_object, near);
         let similarity =
             |pose: &Pose| extractor.recogniser().similarity(&mesh, &image, &camera, pose).unwrap();
         assert!(similarity(&truth).unwrap() > similarity(&beside).unwrap() + 0.1);
