@@ -501,6 +501,16 @@ pub(crate) mod tests {
         .unwrap()
     }
 
+    /// Everything for estimating the poses of an object without anything printed on it, by the products of features.
+    pub(crate) fn without_refiner<'a>(
+        extractor: &'a Extractor,
+        mesh: &'a Mesh,
+        templates: &'a [Template],
+        options: &'a ViewsOptions,
+    ) -> Views<'a> {
+        Views { extractor, mesh, outline: mesh, templates, printed: None, refiner: None, options }
+    }
+
     /// [`part`] in an image of 640x480 pixels, its pose, and its box.
     pub(crate) fn photographed(camera: &Camera) -> (RgbImage, Pose, Rect) {
         let mesh = part();
@@ -530,15 +540,7 @@ pub(crate) mod tests {
         let (image, truth, bbox) = photographed(&camera);
         let find = |outline: bool, bbox: &Rect| {
             let options = ViewsOptions { outline, ..ViewsOptions::default() };
-            let views = Views {
-                extractor: &extractor,
-                mesh: &mesh,
-                outline: &mesh,
-                templates: &templates,
-                printed: None,
-                refiner: None,
-                options: &options,
-            };
+            let views = without_refiner(&extractor, &mesh, &templates, &options);
             views.find(&image, &camera, bbox, None).unwrap().unwrap()
         };
         for outline in [false, true] {

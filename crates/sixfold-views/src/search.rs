@@ -179,7 +179,7 @@ impl Views<'_> {
 mod tests {
     use super::*;
     use crate::estimate::ViewsOptions;
-    use crate::estimate::tests::{part, photographed};
+    use crate::estimate::tests::{part, photographed, without_refiner};
     use crate::templates::{TemplateOptions, make_templates};
     use sixfold_geometry::{Pose, Vec3};
 
@@ -202,15 +202,7 @@ mod tests {
         let most = |place: &Place| templates.iter().map(|t| place.recognised_as(t)).fold(0.0, f32::max);
         let similarity = |place_recognition: f32, place: &Place| {
             let options = ViewsOptions { place_recognition, ..ViewsOptions::default() };
-            let views = Views {
-                extractor: &extractor,
-                mesh: &mesh,
-                outline: &mesh,
-                templates: &templates,
-                printed: None,
-                refiner: None,
-                options: &options,
-            };
+            let views = without_refiner(&extractor, &mesh, &templates, &options);
             views.max_similarity(place)
         };
         let own = place(bbox);
@@ -227,15 +219,7 @@ mod tests {
         let camera = Camera::new(570.0, 570.0, 319.5, 239.5, 640, 480).unwrap();
         let (image, truth, _) = photographed(&camera);
         let (extractor, mesh, options) = (Extractor::shipped().unwrap(), part(), ViewsOptions::default());
-        let views = Views {
-            extractor: &extractor,
-            mesh: &mesh,
-            outline: &mesh,
-            templates: &[],
-            printed: None,
-            refiner: None,
-            options: &options,
-        };
+        let views = without_refiner(&extractor, &mesh, &[], &options);
         let pose =
             |camera_from_object| Hypothesis { camera_from_object, similarity: 0.6, inliers: 20, drawn: 0.0 };
         let beside = truth.with_translation(truth.translation() + Vec3::new(-0.3, 0.1, 0.0));
@@ -273,15 +257,7 @@ mod tests {
         assert!(own > other + 0.1 && none == 0.0, "{own} {other} {none}");
         let similarity = |place_colour: f32| {
             let options = ViewsOptions { place_colour, ..options.clone() };
-            let views = Views {
-                extractor: &extractor,
-                mesh: &mesh,
-                outline: &mesh,
-                templates: &templates,
-                printed: None,
-                refiner: None,
-                options: &options,
-            };
+            let views = without_refiner(&extractor, &mesh, &templates, &options);
             views.max_similarity(&place(&image))
         };
         assert!(similarity(0.5) > similarity(0.0) + 0.1);
