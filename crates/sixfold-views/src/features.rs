@@ -71,19 +71,25 @@ impl Extractor {
             let features =
                 seen.try_into_vec_as::<f32>().map_err(|e| ViewsError::Network { reason: e.to_string() })?;
             for planes in features.chunks_exact(CHANNELS * count) {
-                let mut out = vec![0.0f32; CHANNELS * count];
-                for (cell, feature) in out.chunks_exact_mut(CHANNELS).enumerate() {
-                    let mut square = 0.0;
-                    for (c, value) in feature.iter_mut().enumerate() {
-                        *value = planes[c * count + cell];
-                        square += *value * *value;
-                    }
-                    let length = square.sqrt().max(1e-12);
-                    feature.iter_mut().for_each(|v| *v /= length);
-                }
-                maps.push(FeatureMap { cells, features: out });
+                maps.push(FeatureMap { cells, features: unit_features(planes, count) });
             }
         }
         Ok(maps)
     }
+}
+
+/// The features of `count` cells, each of length 1, from a network's output, channel by channel.
+pub(crate) fn unit_features(planes: &[f32], count: usize) -> Vec<f32> {
+    let channels = planes.len() / count.max(1);
+    let mut out = vec![0.0f32; channels * count];
+    for (cell, feature) in out.chunks_exact_mut(channels.max(1)).enumerate() {
+        let mut square = 0.0;
+        for (c, value) in feature.iter_mut().enumerate() {
+            *value = planes[c * count + cell];
+            square += *value * *value;
+        }
+        let length = square.sqrt().max(1e-12);
+        feature.iter_mut().for_each(|v| *v /= length);
+    }
+    out
 }

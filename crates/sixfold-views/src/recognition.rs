@@ -12,6 +12,7 @@ use sixfold_render::VisibilityBuffer;
 
 use crate::crop::Crop;
 use crate::error::ViewsError;
+use crate::features::unit_features;
 use crate::matching::{best_of, near};
 use crate::templates::{CROP_FACTOR, over_grey, render};
 
@@ -76,7 +77,10 @@ impl Recogniser {
             let Some(last) = maps.pop() else { break };
             let seen =
                 last.try_into_vec_as::<f32>().map_err(|e| ViewsError::Network { reason: e.to_string() })?;
-            out.extend(seen.chunks_exact(CHANNELS * cells * cells).map(|planes| of_planes(planes, cells)));
+            out.extend(
+                seen.chunks_exact(CHANNELS * cells * cells)
+                    .map(|planes| Recognised { cells, features: unit_features(planes, cells * cells) }),
+            );
         }
         Ok(out)
     }
@@ -108,18 +112,6 @@ impl Recogniser {
         let appearance = Appearance::new(view, |i| rendered.shows(i));
         Ok((!appearance.cells.is_empty()).then(|| f64::from(appearance.similarity(seen))))
     }
-}
-
-/// Features cell by cell, of length 1.
-fn of_planes(planes: &[f32], cells: usize) -> Recognised {
-    let count = cells * cells;
-    let mut features = vec![0.0f32; CHANNELS * count];
-    for (cell, feature) in features.chunks_exact_mut(CHANNELS).enumerate() {
-        feature.iter_mut().enumerate().for_each(|(c, v)| *v = planes[c * count + cell]);
-        let length = feature.iter().map(|v| v * v).sum::<f32>().sqrt().max(1e-12);
-        feature.iter_mut().for_each(|v| *v /= length);
-    }
-    Recognised { cells, features }
 }
 
 impl Appearance {

@@ -131,24 +131,25 @@ impl Views<'_> {
         image: &RgbImage,
         camera: &Camera,
     ) -> Result<Vec<Hypothesis>, ViewsError> {
-        let recogniser = self.extractor.recogniser();
-        let of = |pose: &Hypothesis| {
-            recogniser
-                .similarity(self.mesh, image, camera, &pose.camera_from_object)
-                .map(Option::unwrap_or_default)
-        };
-        let similar: Result<Vec<f64>, ViewsError> = poses.par_iter().map(of).collect();
-        // The best pose of each place, with its similarity.
-        let mut places: Vec<(Hypothesis, f64)> = Vec::new();
-        let mut scored: Vec<(f64, Hypothesis)> = Vec::new();
-        for (pose, similar) in poses.into_iter().zip(similar?) {
-            let place = places.iter().find(|(best, _)| self.one(camera, best, &pose)).copied();
-            let (_, similar) = place.unwrap_or_else(|| {
-                places.push((pose, similar.max(0.0)));
-                (pose, similar.max(0.0))
-            });
-            scored.push((pose.similarity * similar, pose));
+        // The best pose of each place, and the place of each pose.
+        let mut best: Vec<Hypothesis> = Vec::new();
+        let mut places: Vec<usize> = Vec::with_capacity(poses.len());
+        for pose in &poses {
+            places.push(best.iter().position(|best| self.one(camera, best, pose)).unwrap_or(best.len()));
+            if places.last() == Some(&best.len()) {
+                best.push(*pose);
+            }
         }
+        let recogniser = self.extractor.recogniser();
+        let similar: Result<Vec<Option<f64>>, ViewsError> = best
+            .par_iter()
+            .map(|pose| recogniser.similarity(self.mesh, image, camera, &pose.camera_from_object))
+            .collect();
+        let similar = similar?;
+        let score = |(pose, place): (Hypothesis, usize)| {
+            (pose.similarity * similar[place].unwrap_or(0.0).max(0.0), pose)
+        };
+        let mut scored: Vec<(f64, Hypothesis)> = poses.into_iter().zip(places).map(score).collect();
         scored.sort_by(|a, b| b.0.total_cmp(&a.0));
         Ok(scored.into_iter().map(|(_, pose)| pose).collect())
     }
