@@ -35,6 +35,7 @@ pub mod schedule;
 pub mod train_error;
 pub mod training;
 pub mod training_log;
+mod vectorised;
 pub mod weights;
 pub mod xfeat;
 

@@ -11,7 +11,7 @@ use sixfold_synth::augment::Patch;
 use crate::crop::Crop;
 use crate::direct::Direct;
 use crate::error::ViewsError;
-use crate::estimate::{Hypothesis, Part, Views};
+use crate::estimate::{Correspondences, Hypothesis, Part, Views};
 use crate::printed::PrintMatches;
 
 /// Weight of colour relative to the initial pose in the object probability of the outline alignment.
@@ -129,24 +129,29 @@ impl Views<'_> {
             camera_from_object: part.crop.to_crop(&hypothesis.camera_from_object),
             ..hypothesis
         };
-        let mut refined = self.moved(vec![start], &part)?;
-        let Some(best) = refined.first_mut() else { return Ok(hypothesis) };
+        let Some((mut best, seen)) = self.moved(vec![start], &part)?.pop() else { return Ok(hypothesis) };
         if self.options.outline {
-            self.align(best, &part)?;
+            self.align(&mut best, seen, &part)?;
         }
-        let direct = self.options.direct && self.align_directly(best, &part)?;
+        let direct = self.options.direct && self.align_directly(&mut best, &part)?;
         let found = part.crop.to_camera(&best.camera_from_object);
         if direct {
-            return Ok(Hypothesis { camera_from_object: found, ..*best });
+            return Ok(Hypothesis { camera_from_object: found, ..best });
         }
         let nearer = found.translation() * (1.0 - self.options.too_far);
-        Ok(Hypothesis { camera_from_object: found.with_translation(nearer), ..*best })
+        Ok(Hypothesis { camera_from_object: found.with_translation(nearer), ..best })
     }
 
-    /// Aligns the outline of a pose; keeps the old pose if the features agree less afterwards.
-    fn align(&self, best: &mut Hypothesis, part: &Part) -> Result<(), ViewsError> {
+    /// Aligns the outline of a pose, at which the crop was `seen` before; keeps the old pose if the features agree less afterwards.
+    fn align(
+        &self,
+        best: &mut Hypothesis,
+        seen: Option<Correspondences>,
+        part: &Part,
+    ) -> Result<(), ViewsError> {
         let Part { crop, patch, .. } = part;
-        let Some((compared, _)) = self.seen_at(best, part)? else { return Ok(()) };
+        let seen = if seen.is_some() { seen } else { self.seen_at(best, part)?.map(|(seen, _)| seen) };
+        let Some(seen) = seen else { return Ok(()) };
         let prior = self.prior(&best.camera_from_object, crop);
         // As for Pix2Pose, whose crops have the same size; weights from a fifth to five times of these change AR_MSSD by less than
         // 0.01.
@@ -165,7 +170,7 @@ impl Views<'_> {
                 .with_edges(patch, EDGES),
             crop: crop.camera,
             centre: (low + high) * 0.5,
-            correspondences: compared,
+            correspondences: seen,
             options: &options,
         };
         if let Some(aligned) = alignment.run(&best.camera_from_object) {

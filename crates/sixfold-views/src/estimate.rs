@@ -18,7 +18,7 @@ use crate::features::{Extractor, FeatureMap};
 use crate::matching::{Match, best_near, dot, mutual_matches, similarity};
 use crate::network::input;
 use crate::printed::{ImageKeypoints, PrintMatches, Printed};
-use crate::refiner::{Refiner, Target};
+use crate::refiner::{Displaced, Refined, Refiner, Target};
 use crate::templates::{CROP_FACTOR, Template, cells_on_object, gathered, input_over_grey, render};
 
 /// Options of the pose estimation.
@@ -244,7 +244,7 @@ impl Views<'_> {
                 kept.push(hypothesis);
             }
         }
-        let mut hypotheses = self.moved(kept, part)?;
+        let mut hypotheses: Vec<Hypothesis> = self.moved(kept, part)?.into_iter().map(|(h, _)| h).collect();
         for hypothesis in &mut hypotheses {
             hypothesis.camera_from_object = part.crop.to_camera(&hypothesis.camera_from_object);
         }
@@ -290,28 +290,27 @@ impl Views<'_> {
         })
     }
 
-    /// Refines poses in a crop with the refiner, or with the products of features if there is none.
+    /// Refines poses in a crop with the refiner, with what was seen at each of them, or with the products of features if there is none.
     pub(crate) fn moved(
         &self,
         hypotheses: Vec<Hypothesis>,
         part: &Part,
-    ) -> Result<Vec<Hypothesis>, ViewsError> {
-        let Some(refiner) = self.refiner else { return self.refined(hypotheses, part) };
+    ) -> Result<Vec<(Hypothesis, Option<Correspondences>)>, ViewsError> {
+        let Some(refiner) = self.refiner else {
+            return Ok(self.refined(hypotheses, part)?.into_iter().map(|h| (h, None)).collect());
+        };
         let poses: Vec<Pose> = hypotheses.iter().map(|h| h.camera_from_object).collect();
         let nearest = MIN_DISTANCE * self.templates_diameter();
-        let refined = refiner.refine(
-            self.extractor,
-            self.mesh,
-            &part.target(),
-            &poses,
-            nearest,
-            self.options.refinements,
-        )?;
-        let mut out = hypotheses;
-        for (hypothesis, (pose, score)) in out.iter_mut().zip(refined) {
-            (hypothesis.camera_from_object, hypothesis.similarity) = (pose, score);
-        }
-        Ok(out)
+        let times = self.options.refinements;
+        let refined = refiner.refine(self.extractor, self.mesh, &part.target(), &poses, nearest, times)?;
+        let moved = hypotheses.into_iter().zip(refined).map(|(hypothesis, refined)| {
+            let Refined { pose, score, seen } = refined;
+            (
+                Hypothesis { camera_from_object: pose, similarity: score, ..hypothesis },
+                seen.map(Displaced::sure),
+            )
+        });
+        Ok(moved.collect())
     }
 
     /// Several iterations of rendering the object at each pose, comparing and updating.
@@ -396,9 +395,9 @@ impl Views<'_> {
         let nearest = MIN_DISTANCE * self.templates_diameter();
         let poses = [hypothesis.camera_from_object];
         let seen = refiner.compare(self.extractor, self.mesh, &part.target(), &poses, nearest)?;
-        Ok(seen.into_iter().next().flatten().map(|d| {
-            let sure = d.points.into_iter().zip(d.pixels).zip(d.weights).filter(|(_, w)| *w > 0.5);
-            (sure.map(|(pair, _)| pair).collect(), d.score)
+        Ok(seen.into_iter().next().flatten().map(|seen| {
+            let score = seen.score;
+            (seen.sure(), score)
         }))
     }
 }

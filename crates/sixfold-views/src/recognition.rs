@@ -13,7 +13,7 @@ use sixfold_render::VisibilityBuffer;
 use crate::crop::Crop;
 use crate::error::ViewsError;
 use crate::features::unit_features;
-use crate::matching::{best_of, near};
+use crate::matching::mean_best;
 use crate::templates::{CROP_FACTOR, over_grey, render};
 
 /// Side of a cell, pixels.
@@ -135,11 +135,7 @@ impl Appearance {
     /// Mean over the view's features of the best product with a feature of the crop near the same position; 0 for a view without
     /// features.
     pub(crate) fn similarity(&self, crop: &Recognised) -> f32 {
-        let mut sum = 0.0;
-        for (cell, feature) in self.cells.iter().zip(self.features.chunks_exact(CHANNELS)) {
-            sum += best_of(feature, &crop.features, near(crop.cells, usize::from(*cell), REACH)).1;
-        }
-        sum / self.cells.len().max(1) as f32
+        mean_best(&self.cells, &self.features, &crop.features, crop.cells, REACH, 1)
     }
 }
 

@@ -23,6 +23,12 @@ use crate::templates::Template;
 /// Boxes of two poses that overlap more than this (intersection over union) belong to one instance.
 const ONE_INSTANCE: f64 = 0.5;
 
+/// Added to standard deviations: views that distinguish nothing do not decide.
+const LEAST_DEVIATION: f32 = 0.02;
+
+/// Number of templates that are compared with all places at a time: about a megabyte.
+const AT_ONCE: usize = 16;
+
 /// A box that may show an object, with the networks' features there.
 pub(crate) struct Place {
     bbox: Rect,
@@ -91,15 +97,18 @@ impl Views<'_> {
         keypoints: Option<&ImageKeypoints>,
         instances: usize,
     ) -> Result<Vec<Hypothesis>, ViewsError> {
-        let mut alike: Vec<(&Place, f32)> =
-            places.par_iter().map(|place| (place, self.max_similarity(place))).collect();
+        let similar = self.place_similarities(places);
+        let mut alike: Vec<(&Place, f32)> = places.iter().zip(similar).collect();
         alike.sort_by(|a, b| b.1.total_cmp(&a.1));
         alike.truncate(self.options.places.saturating_add(instances - 1));
-        let mut pool: Vec<(usize, Hypothesis)> = Vec::new();
-        for (number, (place, _)) in alike.iter().enumerate() {
-            let poses = self.coarse(&place.part, &self.ranked(&place.part), self.options.place_hypotheses)?;
-            pool.extend(poses.into_iter().map(|pose| (number, pose)));
-        }
+        let coarse =
+            |(number, (place, _)): (usize, &(&Place, f32))| -> Result<Vec<(usize, Hypothesis)>, ViewsError> {
+                let poses =
+                    self.coarse(&place.part, &self.ranked(&place.part), self.options.place_hypotheses)?;
+                Ok(poses.into_iter().map(|pose| (number, pose)).collect())
+            };
+        let coarse: Result<Vec<_>, ViewsError> = alike.par_iter().enumerate().map(coarse).collect();
+        let mut pool: Vec<(usize, Hypothesis)> = coarse?.into_iter().flatten().collect();
         pool.sort_by(|a, b| b.1.similarity.total_cmp(&a.1.similarity));
         // The best of all and, if several instances are requested, the best of each place.
         let mut seen = vec![false; alike.len()];
@@ -154,16 +163,27 @@ impl Views<'_> {
         Ok(scored.into_iter().map(|(_, pose)| pose).collect())
     }
 
-    /// Similarity of a crop to its most similar template, on a subset of features: selects the places to examine further.
-    fn max_similarity(&self, place: &Place) -> f32 {
-        let weight = self.options.place_colour;
-        let of = |template| {
+    /// How much more similar the most similar template is to each place than to the other places, in standard deviations over the
+    /// places: some views (plain, without edges) are similar to everything. On a subset of features: selects the places to examine further.
+    fn place_similarities(&self, places: &[Place]) -> Vec<f32> {
+        let templates: Vec<&Template> =
+            self.templates.iter().filter(|t| !t.appearance.cells.is_empty()).collect();
+        let of = |place: &Place, template: &Template| {
             quick_similarity(template, &place.part.map)
-                + weight * place.colour_of(template)
+                + self.options.place_colour * place.colour_of(template)
                 + self.options.place_recognition * place.recognised_as(template)
         };
-        let recognised = self.templates.par_iter().filter(|t| !t.appearance.cells.is_empty());
-        recognised.map(of).reduce(|| f32::NEG_INFINITY, f32::max)
+        // A few templates at a time, which stay in the cache while all places are compared with them.
+        let relatives = |templates: &[&Template]| -> Vec<Vec<f32>> {
+            let mut all = vec![Vec::with_capacity(places.len()); templates.len()];
+            for place in places {
+                all.iter_mut().zip(templates).for_each(|(all, template)| all.push(of(place, template)));
+            }
+            all.into_iter().map(relative).collect()
+        };
+        let all: Vec<Vec<f32>> = templates.par_chunks(AT_ONCE).flat_map_iter(relatives).collect();
+        let most = |place: usize| all.iter().map(|of| of[place]).fold(f32::NEG_INFINITY, f32::max);
+        (0..places.len()).map(most).collect()
     }
 
     /// Whether two poses belong to one instance: their boxes in the image overlap more than [`ONE_INSTANCE`].
@@ -176,11 +196,21 @@ impl Views<'_> {
     }
 }
 
+/// Numbers less their mean, relative to their standard deviation.
+fn relative(mut values: Vec<f32>) -> Vec<f32> {
+    let count = values.len().max(1) as f32;
+    let mean = values.iter().sum::<f32>() / count;
+    let variance = values.iter().map(|v| (v - mean).powi(2)).sum::<f32>() / count;
+    values.iter_mut().for_each(|v| *v = (*v - mean) / (variance.sqrt() + LEAST_DEVIATION));
+    values
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::estimate::ViewsOptions;
     use crate::estimate::tests::{part, photographed, without_refiner};
+    use crate::recognition::{Appearance, CHANNELS};
     use crate::templates::{TemplateOptions, make_templates};
     use sixfold_geometry::{Pose, Vec3};
 
@@ -201,18 +231,59 @@ mod tests {
             Place::new(&extractor, bbox, part).unwrap()
         };
         let most = |place: &Place| templates.iter().map(|t| place.recognised_as(t)).fold(0.0, f32::max);
-        let similarity = |place_recognition: f32, place: &Place| {
-            let options = ViewsOptions { place_recognition, ..ViewsOptions::default() };
-            let views = without_refiner(&extractor, &mesh, &templates, &options);
-            views.max_similarity(place)
-        };
-        let own = place(bbox);
-        for beside in [Rect { x: 40.0, y: 300.0, ..bbox }, Rect { x: 300.0, y: 20.0, ..bbox }] {
-            let other = place(beside);
-            assert!(most(&own) > most(&other) + 0.1, "{} {}", most(&own), most(&other));
-            let gain = |weight: f32| similarity(weight, &own) - similarity(weight, &other);
-            assert!(gain(2.0) > gain(0.0) + 0.1, "{} {}", gain(2.0), gain(0.0));
+        let corners = [[40.0, 300.0], [300.0, 20.0], [20.0, 30.0], [420.0, 330.0], [430.0, 60.0]];
+        let others = corners.map(|[x, y]| place(Rect { x, y, ..bbox }));
+        let places: Vec<Place> = [place(bbox)].into_iter().chain(others).collect();
+        for other in &places[1..] {
+            assert!(most(&places[0]) > most(other) + 0.1, "{} {}", most(&places[0]), most(other));
         }
+        let gain = |place_recognition: f32| {
+            let options = ViewsOptions { place_recognition, ..ViewsOptions::default() };
+            let similar =
+                without_refiner(&extractor, &mesh, &templates, &options).place_similarities(&places);
+            similar[0] - similar[1..].iter().copied().fold(f32::NEG_INFINITY, f32::max)
+        };
+        assert!(gain(2.0) > 0.1 && gain(2.0) > gain(0.0) + 0.1, "{} {}", gain(2.0), gain(0.0));
+    }
+
+    #[test]
+    fn a_view_that_is_similar_to_everything_does_not_decide() {
+        let camera = Camera::new(570.0, 570.0, 319.5, 239.5, 640, 480).unwrap();
+        let (image, _, bbox) = photographed(&camera);
+        let extractor = Extractor::shipped().unwrap();
+        let mesh = part();
+        // Places that differ only in what is recognised there: something common to all, most of it in the first, and something of their own.
+        let place = |[common, own]: [f32; 2], number: usize| {
+            let part = Part::new(&extractor, &image, &camera, &bbox, 32).unwrap().unwrap();
+            let mut features = vec![0.0; 4 * CHANNELS];
+            for cell in features.chunks_exact_mut(CHANNELS) {
+                (cell[0], cell[number + 1]) = (common, own);
+            }
+            Place { bbox, part, chromas: None, recognised: Some(Recognised { cells: 2, features }) }
+        };
+        let places = [place([0.9, 0.4], 0), place([0.8, 0.6], 1), place([0.8, 0.6], 2)];
+        let few = TemplateOptions { directions: 1, rotations: 3, side: 32, ..TemplateOptions::default() };
+        let mut templates = make_templates(&mesh, "part", mesh.diameter(), &extractor, &few).unwrap();
+        templates.retain(|t| !t.appearance.cells.is_empty());
+        for (template, channel) in templates.iter_mut().zip([0, 2]) {
+            let mut features = vec![0.0; CHANNELS];
+            features[channel] = 1.0;
+            template.appearance = Appearance { cells: vec![0], features };
+        }
+        let most: Vec<f32> =
+            places.iter().map(|p| templates.iter().map(|t| p.recognised_as(t)).fold(0.0, f32::max)).collect();
+        assert_eq!(most, [0.9, 0.8, 0.8]);
+        let options = ViewsOptions::default();
+        let similar = without_refiner(&extractor, &mesh, &templates, &options).place_similarities(&places);
+        assert!(similar[1] > similar[0] + 0.1 && similar[0] > similar[2], "{similar:?}");
+    }
+
+    #[test]
+    fn numbers_relative_to_their_deviation() {
+        let deviation = 2f32.sqrt() + LEAST_DEVIATION;
+        assert_eq!(relative(vec![1.0, 3.0, 5.0, 3.0]), [-2.0 / deviation, 0.0, 2.0 / deviation, 0.0]);
+        assert_eq!(relative(vec![0.4, 0.4]), [0.0, 0.0]);
+        assert_eq!(relative(vec![]), [0.0; 0]);
     }
 
     #[test]
@@ -256,11 +327,14 @@ mod tests {
         let best = |place: &Place| templates.iter().map(|t| place.colour_of(t)).fold(0.0, f32::max);
         let [own, other, none] = [&image, &swapped, &grey].map(|image| best(&place(image)));
         assert!(own > other + 0.1 && none == 0.0, "{own} {other} {none}");
-        let similarity = |place_colour: f32| {
-            let options = ViewsOptions { place_colour, ..options.clone() };
-            let views = without_refiner(&extractor, &mesh, &templates, &options);
-            views.max_similarity(&place(&image))
+        // With the weight 0 all are equal: the features are those of grey images.
+        let places = [place(&image), place(&swapped), place(&grey)];
+        let gain = |place_colour: f32| {
+            let options = ViewsOptions { place_colour, place_recognition: 0.0, ..options.clone() };
+            let similar =
+                without_refiner(&extractor, &mesh, &templates, &options).place_similarities(&places);
+            similar[0] - similar[1].max(similar[2])
         };
-        assert!(similarity(0.5) > similarity(0.0) + 0.1);
+        assert!(gain(0.5) > gain(0.0) + 0.1, "{} {}", gain(0.5), gain(0.0));
     }
 }
