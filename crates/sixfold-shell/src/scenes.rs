@@ -12,16 +12,20 @@ use sixfold_bop::{
     ground_truth_visibility,
 };
 use sixfold_geometry::random::stream;
-use sixfold_geometry::{Camera, DepthImage, Mask, Pose};
+use sixfold_geometry::{Camera, DepthImage, Mask, Pose, RgbImage};
 use sixfold_io::CameraFile;
 use sixfold_mesh::{Mesh, ModelInfo, ModelsInfo, Unit, read_mesh};
 use sixfold_render::DepthSensor;
 use sixfold_simulation::{ConvexParts, PartsOptions, Tabletop, TabletopOptions};
+use sixfold_synth::augment::Backgrounds;
 use sixfold_synth::shapes::{Family, member, toy};
 use sixfold_synth::with_own_color;
 
 use crate::folder::DatasetFolder;
 use crate::progress::{Progress, check_interrupt};
+
+/// Random stream of the backgrounds.
+const BACKGROUND: u64 = 0x6261_636B;
 
 /// Metres per unit of the depth files, for depths up to 6.5 m.
 pub const DEPTH_SCALE: f64 = 1e-4;
@@ -200,6 +204,8 @@ pub struct SceneMaker<'a> {
     pub views: usize,
     /// Write colour images.
     pub rgb: bool,
+    /// Shown in the colour images wherever no object is; `None` for the plane itself.
+    pub backgrounds: Option<Backgrounds>,
     /// Write masks.
     pub masks: bool,
 }
@@ -259,7 +265,7 @@ impl SceneMaker<'_> {
         let noise = self.tabletop.seed ^ (u64::from(scene_id) << 32 | u64::from(im_id));
         let meshes: Vec<&Mesh> = self.objects.iter().map(|o| &o.model.mesh).collect();
         let sensor = self.sensor.as_ref().map(|sensor| (sensor, noise));
-        let seen = scene.image(&meshes, &self.camera, camera_from_world, sensor, self.rgb);
+        let mut seen = scene.image(&meshes, &self.camera, camera_from_world, sensor, self.rgb);
         let resting =
             || scene.resting.iter().map(|(o, _)| &self.objects[*o].model).zip(&seen.camera_from_object);
         let truth: Vec<GroundTruth> =
@@ -269,6 +275,11 @@ impl SceneMaker<'_> {
         let infos: Vec<_> = visible.iter().map(|v| v.info).collect();
         let (masks, masks_visible): (Vec<Mask>, Vec<Mask>) =
             visible.into_iter().map(|v| (v.mask, v.mask_visible)).unzip();
+        if let (Some(rgb), Some(backgrounds)) = (&mut seen.rgb, &self.backgrounds) {
+            let mut random = stream(noise, BACKGROUND);
+            let behind = backgrounds.patch(self.camera.width, self.camera.height, &mut random).to_rgb();
+            show_behind(rgb, &masks_visible, &behind);
+        }
         writer.add(&NewImage {
             depth_scale: DEPTH_SCALE,
             camera_from_world: Some(*camera_from_world),
@@ -281,6 +292,15 @@ impl SceneMaker<'_> {
             ..NewImage::new(im_id, &self.camera)
         })?;
         Ok(())
+    }
+}
+
+/// Replaces every pixel that shows no object by that of another image.
+fn show_behind(image: &mut RgbImage, objects: &[Mask], behind: &RgbImage) {
+    for (i, (pixel, new)) in image.as_mut_slice().iter_mut().zip(behind.as_slice()).enumerate() {
+        if objects.iter().all(|mask| !mask.as_slice()[i]) {
+            *pixel = *new;
+        }
     }
 }
 

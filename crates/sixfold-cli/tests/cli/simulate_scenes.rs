@@ -28,6 +28,44 @@ fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {
 }
 
 #[test]
+fn photographs_are_shown_wherever_no_object_is() {
+    let one = OneImage::new();
+    let dir = one.path();
+    std::fs::create_dir(dir.join("photographs")).unwrap();
+    // Of one colour, so that every crop is known.
+    let green = sixfold_geometry::RgbImage::from_fn(60, 40, |_, _| [10, 200, 30]);
+    sixfold_io::write_rgb(&dir.join("photographs/green.png"), &green).unwrap();
+    let made = |options: &str| {
+        sixfold(dir, &format!("{SMALL} {options}")).expect(0);
+        let name = options.split_whitespace().last().unwrap();
+        BopDataset::open(&dir.join(name), "test").unwrap()
+    };
+    let [plain, green] = [made("--out plain"), made("--backgrounds photographs --out green")];
+    let mut behind = 0;
+    for scene_id in [0, 1] {
+        let (plain, green) = (plain.scene(scene_id).unwrap(), green.scene(scene_id).unwrap());
+        for im_id in [0, 1] {
+            let objects = plain.image(im_id).unwrap().ground_truth.len();
+            let mask = |i| plain.mask(im_id, i, MaskKind::Visible).unwrap().unwrap();
+            let masks: Vec<sixfold_geometry::Mask> = (0..objects).map(mask).collect();
+            let (before, after) = (plain.rgb(im_id).unwrap().unwrap(), green.rgb(im_id).unwrap().unwrap());
+            for (i, (before, after)) in before.as_slice().iter().zip(after.as_slice()).enumerate() {
+                let object = masks.iter().any(|mask| mask.as_slice()[i]);
+                behind += usize::from(!object);
+                assert_eq!(*after, if object { *before } else { [10, 200, 30] });
+            }
+            assert_eq!(plain.depth(im_id).unwrap(), green.depth(im_id).unwrap());
+        }
+    }
+    assert!(behind > 1000);
+    // Other photographs are another data set; without any there is an error.
+    std::fs::create_dir(dir.join("none")).unwrap();
+    let error = sixfold(dir, &format!("{SMALL} --backgrounds none --out none-out")).expect(2).stderr;
+    assert!(error.contains("none"), "{error}");
+    sixfold(dir, &format!("{SMALL} --backgrounds photographs --no-rgb --out other")).expect(2);
+}
+
+#[test]
 fn scenes_are_a_dataset_of_their_own() {
     let one = OneImage::new();
     let dir = one.path();

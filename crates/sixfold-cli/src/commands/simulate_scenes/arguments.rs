@@ -23,7 +23,8 @@ const MAX_OBJECTS: usize = 10_000;
 pub(crate) const AFTER_HELP: &str = "Examples:\n  \
     sixfold simulate-scenes --object mug.ply drill.ply --unit mm --scenes 5 --out out/scenes\n  \
     sixfold simulate-scenes --families can,mug --toys 40 --scenes 100 --views 10 --out out/toys\n  \
-    sixfold simulate-scenes --dataset lmo --sensor xtion --out out/lmo-scenes\n\n\
+    sixfold simulate-scenes --dataset lmo --sensor xtion --out out/lmo-scenes\n  \
+    sixfold simulate-scenes --families all --backgrounds photographs --out out/colour\n\n\
     The folder is a BOP dataset, for `sixfold estimate --dataset` and `sixfold eval`. preview.png shows its first scenes.\n\
     After a stop, the same command resumes.";
 
@@ -86,6 +87,9 @@ pub(crate) struct SimulateScenesArguments {
     /// Camera file (default: 640x480, focal length 575 pixels, as a Kinect)
     #[arg(long, value_name = "FILE")]
     pub camera: Option<PathBuf>,
+    /// Folder of photographs (PNG, JPEG), shown in the colour images wherever no object is (default: the plane and black)
+    #[arg(long, value_name = "DIR", conflicts_with = "no_rgb")]
+    pub backgrounds: Option<PathBuf>,
     /// Leave out the colour images (and the preview, which is made of them)
     #[arg(long)]
     pub no_rgb: bool,
@@ -186,6 +190,9 @@ impl SimulateScenesArguments {
         if let Some(camera) = &self.camera {
             contents.add_path("camera", camera)?;
         }
+        if let Some(folder) = &self.backgrounds {
+            contents.add_path("backgrounds", folder)?;
+        }
         let synthetic = self.chosen_families()?.len() * self.members + self.toys;
         for model in &models.0[..models.0.len() - synthetic] {
             contents.add_object(&format!("object {}", model.id), &model.mesh, &model.info);
@@ -231,7 +238,7 @@ impl SimulateScenesArguments {
             "stacked": self.stacked, "exact": self.exact, "distance": self.distance,
             "elevation": self.elevation, "sensor": format!("{:?}", self.sensor),
             "camera": self.camera.as_deref().map(path), "no-rgb": self.no_rgb, "no-masks": self.no_masks,
-            "split": self.split,
+            "backgrounds": self.backgrounds.as_deref().map(path), "split": self.split,
             "seed": self.seed,
         })
     }

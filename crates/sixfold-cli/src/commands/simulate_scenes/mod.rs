@@ -9,6 +9,7 @@ use anyhow::Result;
 use serde::Serialize;
 use sixfold_bop::{BopDataset, write_camera, write_targets};
 use sixfold_io::write_rgb;
+use sixfold_synth::augment::{Backgrounds, PhotographOptions};
 
 use self::arguments::SimulateScenesArguments;
 use sixfold_shell::Outcome;
@@ -17,6 +18,9 @@ use sixfold_shell::output::report;
 use sixfold_shell::pictures::Pictures;
 use sixfold_shell::scenes::{Counts, DEPTH_SCALE, SceneMaker, pinhole, write_objects};
 use sixfold_shell::sheets::first_scenes;
+
+/// Photographs for backgrounds are reduced to this length, pixels.
+const LONGEST_SIDE: usize = 1280;
 
 #[derive(Serialize)]
 struct Summary {
@@ -42,8 +46,12 @@ pub(crate) fn run(a: &SimulateScenesArguments) -> Result<Outcome> {
     a.check()?;
     let camera = pinhole(a.camera.as_deref())?;
     // Other options are refused before the slow preparation of the objects.
-    let inputs: Vec<&Path> = [&a.dataset, &a.camera].into_iter().flatten().map(|p| p.as_path()).collect();
+    let inputs: Vec<&Path> =
+        [&a.dataset, &a.camera, &a.backgrounds].into_iter().flatten().map(|p| p.as_path()).collect();
     let folder = DatasetFolder::take(&a.out, "simulate-scenes", a.deciding(), &inputs)?;
+    let photographs = PhotographOptions { longest_side: LONGEST_SIDE, ..PhotographOptions::default() };
+    let backgrounds =
+        a.backgrounds.as_ref().map(|dir| Backgrounds::from_folder(dir, &photographs)).transpose()?;
     let models = a.models()?;
     folder.begin(&a.contents(&models)?)?;
     let objects = models.ready(a.exact)?;
@@ -57,6 +65,7 @@ pub(crate) fn run(a: &SimulateScenesArguments) -> Result<Outcome> {
         sensor: a.sensor.model(),
         views: a.views,
         rgb: !a.no_rgb,
+        backgrounds,
         masks: !a.no_masks,
     };
     let start = std::time::Instant::now();
