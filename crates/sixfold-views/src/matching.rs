@@ -170,6 +170,14 @@ mod tests {
     }
 
     #[test]
+    fn quick_similarity_takes_every_fourth_feature() {
+        // The first and the fifth of six features are at their cells, the others far away.
+        let template = template(&[0, 1, 2, 4, 15, 5], &[0, 15, 15, 15, 15, 15]);
+        assert_eq!(quick_similarity(&template, &map()), 1.0);
+        assert_eq!(similarity(&template, &map(), 1), 2.0 / 6.0);
+    }
+
+    #[test]
     fn colours_are_compared_cell_by_cell() {
         let mut coloured = template(&[5, 10], &[6, 11]);
         let mut crop = vec![[0.0; 2]; 16];

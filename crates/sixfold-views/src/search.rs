@@ -1,6 +1,7 @@
 //! Search without a given region: a detector of any object proposes boxes, the object's templates select those similar to it, and
 //! poses are estimated there (the structure of CNOS, Nguyen et al. 2023, whose proposals and features come from foundation models; ours
-//! are small networks). Of the poses, those at which the image is recognised as the object come first (`recognition`).
+//! are small networks). Similarities are standardised for each view, over all boxes: `(s - mean) / deviation` (as in speaker verification, Z-norm,
+//! Auckenthaler et al. 2000). Of the poses, those at which the image is recognised as the object come first (`recognition`).
 //!
 //! Proposals and their features belong to the image: they are computed once, for all objects searched in it.
 
@@ -97,8 +98,7 @@ impl Views<'_> {
         keypoints: Option<&ImageKeypoints>,
         instances: usize,
     ) -> Result<Vec<Hypothesis>, ViewsError> {
-        let similar = self.place_similarities(places);
-        let mut alike: Vec<(&Place, f32)> = places.iter().zip(similar).collect();
+        let mut alike: Vec<(&Place, f32)> = places.iter().zip(self.place_similarities(places)).collect();
         alike.sort_by(|a, b| b.1.total_cmp(&a.1));
         alike.truncate(self.options.places.saturating_add(instances - 1));
         let coarse =
