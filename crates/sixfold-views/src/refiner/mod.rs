@@ -371,6 +371,18 @@ mod tests {
         assert!((seen.score - refined[0].score).abs() < 1e-5, "{} {}", seen.score, refined[0].score);
         let off = seen.pixels.iter().zip(&kept.pixels).map(|(a, b)| (a - b).norm()).fold(0.0, f64::max);
         assert!(off < 1e-3, "{off}");
+        // The first pose that hardly moves is final, however many iterations are allowed.
+        let refine = |pose: Pose, times: usize| {
+            refiner.refine(&extractor, &mesh, &target, &[pose], 0.05, times).unwrap().remove(0).pose
+        };
+        let mut still = refine(near, 8);
+        for _ in 0..8 {
+            still = refine(still, 1);
+        }
+        let seen = refiner.compare(&extractor, &mesh, &target, &[still], 0.05).unwrap().remove(0).unwrap();
+        let next = seen.pose(&crop.camera, &still).unwrap();
+        assert!(next != still && !seen.moves(&crop.camera, &still, &next));
+        assert_eq!(refine(still, 8), still);
     }
 
     #[test]
