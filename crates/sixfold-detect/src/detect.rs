@@ -26,6 +26,9 @@ pub struct DetectOptions {
     /// Number of sizes at which the network processes the image, each smaller by the square root of two: a detector of any object
     /// finds large ones better in a reduced image. Networks with anchors accept 1 only.
     pub scales: usize,
+    /// Whether a box is the mean of all boxes that it suppresses, weighted by their scores (box voting, Gidaris and Komodakis 2015,
+    /// "Object detection via a multi-region and semantic segmentation-aware CNN model", section 5). Networks with anchors ignore it.
+    pub voting: bool,
     /// Also compute masks.
     pub masks: bool,
 }
@@ -39,6 +42,7 @@ impl Default for DetectOptions {
             per_class: 100,
             max_detections: 100,
             scales: 1,
+            voting: false,
             masks: true,
         }
     }
@@ -177,26 +181,40 @@ fn overlap(a: &[f32; 4], b: &[f32; 4]) -> f32 {
 }
 
 /// Non-maximum suppression for each class separately: in order of decreasing score, boxes that overlap a kept box of their class by
-/// more than `most_overlap` are left out; at most `per_class` of a class and `most` in total are kept. Equal scores keep their
-/// order.
-fn suppress(
-    mut candidates: Vec<Candidate>,
-    most_overlap: f32,
-    per_class: usize,
-    max_detections: usize,
-) -> Vec<Candidate> {
+/// more than `overlap` are left out; at most `per_class` of a class and `max_detections` in total are kept. Equal scores keep their
+/// order. With `voting` the boxes are then means.
+fn suppress(mut candidates: Vec<Candidate>, options: &DetectOptions) -> Vec<Candidate> {
+    let DetectOptions { overlap: most_overlap, per_class, max_detections, voting, .. } = *options;
     candidates.sort_by(|a, b| b.score.total_cmp(&a.score));
     let mut kept: Vec<Candidate> = vec![];
-    for c in candidates {
+    for c in &candidates {
         if kept.len() == max_detections {
             break;
         }
         let mut same = kept.iter().filter(|k| k.class == c.class);
         if same.clone().count() < per_class && !same.any(|k| overlap(&k.corners, &c.corners) > most_overlap) {
-            kept.push(c);
+            kept.push(*c);
         }
     }
+    if voting {
+        let voted: Vec<[f32; 4]> = kept.iter().map(|k| voted(k, &candidates, most_overlap)).collect();
+        kept.iter_mut().zip(voted).for_each(|(k, corners)| k.corners = corners);
+    }
     kept
+}
+
+/// The mean of all boxes of the class that overlap a box by more than `most_overlap`, itself included, weighted by their scores.
+fn voted(of: &Candidate, candidates: &[Candidate], most_overlap: f32) -> [f32; 4] {
+    let mut sum = [0.0f32; 4];
+    let mut weight = 0.0;
+    for c in candidates {
+        if c.class == of.class && overlap(&of.corners, &c.corners) > most_overlap {
+            sum.iter_mut().zip(c.corners).for_each(|(sum, side)| *sum += c.score * side);
+            weight += c.score;
+        }
+    }
+    // Without a vote (an overlap of 1, scores of 0) the box stays.
+    if weight > 0.0 { sum.map(|side| side / weight) } else { of.corners }
 }
 
 /// Detections in an image of `size` (columns, rows), best first.
@@ -241,7 +259,7 @@ pub fn decode(
     let to_image = |v: f32, last: usize| {
         f64::from(((v + 0.5) * image.step - 0.5).clamp(0.0, last.saturating_sub(1) as f32))
     };
-    suppress(candidates, options.overlap, options.per_class, options.max_detections)
+    suppress(candidates, options)
         .into_iter()
         .map(|c| {
             let [left, top, right, bottom] = c.corners;
@@ -267,8 +285,15 @@ pub(crate) fn merged(mut scales: Vec<Vec<Detected>>, options: &DetectOptions) ->
         Some(Candidate { class: d.class, score: d.score, corners, level: 0, location })
     };
     let candidates = all.iter().enumerate().filter_map(candidate).collect();
-    let kept = suppress(candidates, options.overlap, options.per_class, options.max_detections);
-    kept.iter().filter_map(|c| all[c.location].take()).collect()
+    suppress(candidates, options)
+        .iter()
+        .filter_map(|c| {
+            let [left, top, right, bottom] = c.corners.map(f64::from);
+            let detected = all[c.location].take()?;
+            let bbox = Rect { x: left, y: top, width: right - left, height: bottom - top };
+            Some(if options.voting { Detected { bbox, ..detected } } else { detected })
+        })
+        .collect()
 }
 
 /// A candidate's mask in the image: the sum of prototypes within its box, one block of prototype pixels wider.
@@ -338,10 +363,30 @@ mod tests {
             candidate(0, 0.6, [20.0, 0.0, 30.0, 10.0]),
         ];
         let scores = |kept: Vec<Candidate>| kept.iter().map(|c| c.score).collect::<Vec<_>>();
-        assert_eq!(scores(suppress(all.clone(), 0.5, 9, 9)), [0.9, 0.6, 0.4]);
-        assert_eq!(scores(suppress(all.clone(), 0.5, 1, 9)), [0.9, 0.4]);
-        assert_eq!(scores(suppress(all.clone(), 0.5, 9, 1)), [0.9]);
-        assert_eq!(scores(suppress(all, 0.9, 9, 9)), [0.9, 0.6, 0.5, 0.4]);
+        let options = DetectOptions::default();
+        assert_eq!(scores(suppress(all.clone(), &options)), [0.9, 0.6, 0.4]);
+        assert_eq!(scores(suppress(all.clone(), &DetectOptions { per_class: 1, ..options })), [0.9, 0.4]);
+        assert_eq!(scores(suppress(all.clone(), &DetectOptions { max_detections: 1, ..options })), [0.9]);
+        assert_eq!(scores(suppress(all, &DetectOptions { overlap: 0.9, ..options })), [0.9, 0.6, 0.5, 0.4]);
+    }
+
+    #[test]
+    fn with_voting_a_box_is_the_mean_of_those_that_it_suppresses() {
+        let all = vec![
+            candidate(0, 0.25, [0.0, 0.0, 10.0, 10.0]),
+            candidate(0, 0.75, [1.0, 0.0, 11.0, 12.0]),
+            candidate(1, 0.5, [0.0, 0.0, 10.0, 10.0]),
+            candidate(0, 0.5, [20.0, 0.0, 30.0, 10.0]),
+        ];
+        let corners = |options: &DetectOptions| {
+            suppress(all.clone(), options).iter().map(|c| c.corners).collect::<Vec<_>>()
+        };
+        let options = DetectOptions { voting: true, ..DetectOptions::default() };
+        let others = [[0.0, 0.0, 10.0, 10.0], [20.0, 0.0, 30.0, 10.0]];
+        assert_eq!(corners(&options), [[0.75, 0.0, 10.75, 11.5], others[0], others[1]]);
+        assert_eq!(corners(&DetectOptions { voting: false, ..options })[0], all[1].corners);
+        // Nothing overlaps by more than 1, not even a box with itself.
+        assert_eq!(corners(&DetectOptions { overlap: 1.0, ..options })[0], all[1].corners);
     }
 
     #[test]
@@ -361,6 +406,10 @@ mod tests {
         assert_eq!(merged_with(&DetectOptions { max_detections: 2, ..options }).len(), 2);
         assert_eq!(merged_with(&DetectOptions { overlap: 0.9, ..options }).len(), 4);
         assert_eq!(merged(vec![scales[0].clone()], &options), scales[0]);
+        let voted = merged_with(&DetectOptions { voting: true, ..options });
+        let [x, mean] = [voted[0].bbox.x, 0.7 / 1.6];
+        assert!((x - mean).abs() < 1e-6 && (voted[0].bbox.width - 10.0).abs() < 1e-5, "{x}");
+        assert!(voted[0].mask == all[0].mask && voted[1].bbox.iou(&all[1].bbox) > 0.999);
         for scales in [0, MAX_SCALES + 1] {
             let message = DetectOptions { scales, ..options }.check().unwrap_err();
             assert!(message.contains("scales") && message.contains("1 to 7"), "{message}");

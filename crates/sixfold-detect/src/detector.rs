@@ -56,6 +56,7 @@ impl TrainedDetector {
             masks: false,
             scales: if self.model.has_scales() { PROPOSAL_SCALES } else { 1 },
             overlap: PROPOSAL_OVERLAP,
+            voting: true,
             per_class: MAX_PROPOSALS,
             max_detections: MAX_PROPOSALS,
             ..self.options

@@ -380,7 +380,8 @@ fn anchored(
     image: &RgbImage,
     options: &DetectOptions,
 ) -> Vec<Detected> {
-    let DetectOptions { threshold, overlap, per_class, max_detections, masks, scales: _ } = *options;
+    let DetectOptions { threshold, overlap, per_class, max_detections, masks, scales: _, voting: _ } =
+        *options;
     let thresholds = Thresholds {
         score: threshold,
         overlap: f64::from(overlap),

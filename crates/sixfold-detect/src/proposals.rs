@@ -4,13 +4,14 @@
 //! Its detections are *proposals*: boxes and masks without a class. CNOS (Nguyen et al. 2023) uses a foundation model for them;
 //! here it is EfficientNet-Lite0 with a pyramid, as in the detector of known objects.
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use burn::tensor::Device;
 use rand::RngExt;
 use sixfold_data::{TrainingObject, background_files, plain_backgrounds};
-use sixfold_geometry::Pose;
 use sixfold_geometry::random::{Random, stream};
+use sixfold_geometry::{Pose, Vec3};
 use sixfold_mesh::{Mesh, ModelInfo};
 use sixfold_nn::fingerprint::Fingerprint;
 use sixfold_nn::lite0::imagenet_encoder;
@@ -26,16 +27,23 @@ use sixfold_synth::shapes::toy;
 use crate::model::{ClassEntry, DetectorModel, DetectorUse};
 use crate::network::{DetectorConfig, Encoder};
 use crate::samples::{TrainingImageOptions, TrainingImageSource};
+use crate::tabletop::natural_color;
 use crate::training::{DetectorTraining, DetectorTrainingOptions};
 
 /// Id of the one class.
 pub const ANY_OBJECT: u32 = 0;
 /// Proposals with a lower score are left out by default.
 const THRESHOLD: f32 = 0.1;
+/// Stages of the encoder, all of which are frozen.
+const STAGES: usize = 5;
 /// Fraction of toys and household shapes; the others are solids in the textures of photographs.
 const TOYS: f32 = 0.6;
-/// Fraction of toys in one colour; the others have several colours with smooth transitions.
-const PLAIN: f32 = 0.7;
+/// Fraction of toys in one colour.
+const ONE_COLOR: f32 = 0.4;
+/// Fraction of toys with two or three colours, one for each solid; the others have smooth transitions.
+const PARTS: f32 = 0.4;
+/// Upper bound of the number of solids in a toy that have their own colour.
+const MOST_SOLIDS: usize = 16;
 /// Range of sizes of the solids, metres; toys have their own sizes.
 const SOLID: [f64; 2] = [0.08, 0.25];
 
@@ -56,7 +64,9 @@ pub struct ProposalsRecipe {
 
 impl Default for ProposalsRecipe {
     fn default() -> Self {
-        let options = DetectorTrainingOptions::default();
+        // A frozen encoder transfers better from synthetic to real images (Hinterstoisser et al. 2017, "On pre-trained image
+        // features and synthetic images for deep learning").
+        let options = DetectorTrainingOptions { frozen_stages: STAGES, ..DetectorTrainingOptions::default() };
         ProposalsRecipe { options, objects: 400, size: 320, backgrounds: None, command: String::new() }
     }
 }
@@ -69,7 +79,7 @@ impl ProposalsRecipe {
             empty_fraction: 0.05,
             scale: [0.4, 1.6],
             max_pasted: 10,
-            tabletop_fraction: 0.75,
+            tabletop_fraction: 0.85,
             rotation: std::f32::consts::PI,
             render_fraction: 1.0,
             max_distractors: 2,
@@ -107,18 +117,58 @@ impl ProposalsRecipe {
 fn object(textures: &Backgrounds, random: &mut Random) -> Option<Mesh> {
     let mesh = if random.random::<f32>() < TOYS {
         let toy = toy(random).ok()?;
-        if random.random::<f32>() < PLAIN {
-            let color = std::array::from_fn(|_| random.random_range(15..=240u8));
-            let count = toy.vertices().len();
-            toy.with_colors(vec![color; count]).ok()?
-        } else {
-            randomly_colored(&toy, random)
+        match random.random::<f32>() {
+            kind if kind < ONE_COLOR => {
+                let colors = vec![natural_color(random); toy.vertices().len()];
+                toy.with_colors(colors).ok()?
+            }
+            kind if kind < ONE_COLOR + PARTS => in_parts(toy, random)?,
+            _ => randomly_colored(&toy, random),
         }
     } else {
         random_solid(textures, &[], random).scaled(SOLID[0] + (SOLID[1] - SOLID[0]) * random.random::<f64>())
     };
     let (low, high) = mesh.bounding_box();
     Some(mesh.transformed(&Pose::from_translation(-(low + high) * 0.5)))
+}
+
+/// The number of the unconnected solid to which each vertex belongs, numbered in the order of the vertices.
+fn solids(mesh: &Mesh) -> Vec<usize> {
+    fn root(parents: &[usize], mut at: usize) -> usize {
+        while parents[at] != at {
+            at = parents[at];
+        }
+        at
+    }
+    // Vertices at one place are connected: the sides of boxes have vertices of their own.
+    let mut places = BTreeMap::new();
+    let at_place = |(number, vertex): (usize, &Vec3)| {
+        let place: [u64; 3] = std::array::from_fn(|axis| vertex[axis].to_bits());
+        *places.entry(place).or_insert(number)
+    };
+    let mut parents: Vec<usize> = mesh.vertices().iter().enumerate().map(at_place).collect();
+    for face in mesh.faces() {
+        let roots = face.map(|v| root(&parents, v as usize));
+        let first = roots.into_iter().min().unwrap_or_default();
+        roots.into_iter().for_each(|r| parents[r] = first);
+    }
+    let mut numbers = BTreeMap::new();
+    (0..parents.len())
+        .map(|v| {
+            let next = numbers.len();
+            *numbers.entry(root(&parents, v)).or_insert(next)
+        })
+        .collect()
+}
+
+/// A mesh of several solids, each in one of two or three colours.
+fn in_parts(mesh: Mesh, random: &mut Random) -> Option<Mesh> {
+    let palette: Vec<[u8; 3]> = (0..random.random_range(2..=3u32)).map(|_| natural_color(random)).collect();
+    let of_solid: Vec<[u8; 3]> = (0..mesh.vertices().len().min(MOST_SOLIDS))
+        .map(|_| palette[random.random_range(0..palette.len())])
+        .collect();
+    let colors = solids(&mesh).into_iter().map(|solid| of_solid[solid % of_solid.len()]).collect();
+    mesh.with_colors(colors).ok()
 }
 
 fn objects(textures: &Backgrounds, count: usize, seed: u64) -> Vec<TrainingObject> {
@@ -174,7 +224,8 @@ impl Recipe for ProposalsRecipe {
         _: &mut Session<'_>,
     ) -> Result<Prepared<DetectorTraining, Backgrounds>, TrainError> {
         let device = Device::flex().autodiff();
-        let config = DetectorConfig::compact(1);
+
+        let config = DetectorConfig { shared: 2, own: 2, ..DetectorConfig::compact(1) };
         let encoder = Encoder::Lite0(imagenet_encoder(&device)?);
         let network = config.init_with(encoder, self.seed(), &device);
         let textures = self.backgrounds()?;
@@ -240,6 +291,29 @@ mod tests {
         let command = "another".to_owned();
         let same = ProposalsRecipe { command, ..ProposalsRecipe::default() };
         assert_eq!(of(&same), of(&ProposalsRecipe::default()));
+    }
+
+    #[test]
+    fn each_solid_of_a_toy_has_one_color() {
+        let mut random = stream(1, 0);
+        let mut several = 0;
+        for _ in 0..20 {
+            let toy = toy(&mut random).unwrap();
+            let numbers = solids(&toy);
+            assert!(
+                toy.faces().iter().all(|f| f.iter().all(|v| numbers[*v as usize] == numbers[f[0] as usize]))
+            );
+            let count = numbers.iter().max().unwrap() + 1;
+            assert!((3..=8).contains(&count), "{count}");
+            let colored = in_parts(toy, &mut random).unwrap();
+            let colors = colored.colors().unwrap();
+            let of_solid: std::collections::BTreeSet<_> = numbers.iter().zip(colors).collect();
+            assert_eq!(of_solid.len(), count);
+            let different: std::collections::BTreeSet<_> = colors.iter().collect();
+            assert!(different.len() <= 3);
+            several += usize::from(different.len() > 1);
+        }
+        assert!(several > 14, "{several}");
     }
 
     #[test]

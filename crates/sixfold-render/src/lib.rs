@@ -15,11 +15,13 @@ mod raster;
 mod sensor;
 mod shade;
 mod shadow;
+mod shadow_map;
 mod table;
 
 pub use outputs::{BoundingBoxScale, Surface};
 pub use portrait::{portrait, portrait_camera, portrait_pose};
 pub use raster::{Canvas, Culling, RenderOptions, SceneObject, VisibilityBuffer, render_depth};
 pub use sensor::{DepthSensor, Draws, simulate_depth};
-pub use shade::{Light, Material, shade};
+pub use shade::{Light, Material, shade, shade_in_shadows};
+pub use shadow_map::ShadowMap;
 pub use table::{DepthOnTable, depth_on_table, support_plane};

@@ -58,7 +58,7 @@ impl Default for Material {
     }
 }
 
-/// Renders the frame's objects in colour over `background` (black when `None`).
+/// Renders the frame's objects in colour over `background` (black when `None`), without shadows.
 ///
 /// # Panics
 /// When `background` has another size than the frame.
@@ -66,6 +66,22 @@ pub fn shade(
     frame: &VisibilityBuffer,
     objects: &[SceneObject<'_>],
     lights: &[Light],
+    material: &Material,
+    background: Option<&RgbImage>,
+) -> RgbImage {
+    shade_in_shadows(frame, objects, lights, &|_, _| 1.0, material, background)
+}
+
+/// [`shade`] with shadows: `visible(light, point)` is the fraction of the light with this index that reaches a point in the camera
+/// frame, 0..1. It is not called for ambient light. See [`ShadowMap`](crate::ShadowMap).
+///
+/// # Panics
+/// When `background` has another size than the frame.
+pub fn shade_in_shadows(
+    frame: &VisibilityBuffer,
+    objects: &[SceneObject<'_>],
+    lights: &[Light],
+    visible: &dyn Fn(usize, &Vec3) -> f32,
     material: &Material,
     background: Option<&RgbImage>,
 ) -> RgbImage {
@@ -94,7 +110,7 @@ pub fn shade(
         let normal = surface_normal(&objects[object], face, weights, corners, &point);
         let view = -point.normalize();
         let mut color = [0.0f32; 3];
-        for light in lights {
+        for (number, light) in lights.iter().enumerate() {
             let (towards, power) = match light {
                 Light::Ambient { color: c } => {
                     for k in 0..3 {
@@ -119,8 +135,9 @@ pub fn shade(
             } else {
                 0.0
             };
+            let lit = if diffuse > 0.0 { visible(number, &point) } else { 0.0 };
             for k in 0..3 {
-                color[k] += power[k] * (diffuse * albedo[k] + highlight);
+                color[k] += lit * power[k] * (diffuse * albedo[k] + highlight);
             }
         }
         out.as_mut_slice()[index] = color.map(to_srgb);

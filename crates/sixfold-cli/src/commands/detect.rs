@@ -71,6 +71,7 @@ pub(crate) fn run(a: &DetectArguments) -> Result<Outcome> {
         per_class: a.per_object.unwrap_or(own.per_class),
         max_detections: a.max_detections.unwrap_or(own.max_detections),
         scales: a.scales.unwrap_or(own.scales),
+        voting: own.voting,
         masks: !a.no_masks,
     };
     options.check().map_err(|message| anyhow!(message))?;
