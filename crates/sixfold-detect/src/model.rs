@@ -215,7 +215,7 @@ impl DetectorModel {
     /// [`ModelError`] if the shipped weights have another version than the program.
     pub fn proposals() -> Result<Self, ModelError> {
         let device = Device::flex();
-        let config = DetectorConfig::compact(1);
+        let config = DetectorConfig::proposals();
         let name = Path::new("proposals.safetensors");
         let (network, card) =
             load_weights_from_bytes(config.init(0, &device), name, PROPOSALS, architecture(&config))?;

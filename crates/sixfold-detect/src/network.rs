@@ -96,6 +96,11 @@ impl DetectorConfig {
         }
     }
 
+    /// The detector of any object: one class, and deeper heads, because its encoder is frozen.
+    pub fn proposals() -> Self {
+        DetectorConfig { shared: 2, own: 2, ..DetectorConfig::compact(1) }
+    }
+
     /// RetinaNet's pyramid and heads on ResNet-50 (Lin et al. 2017): five levels of 256 channels, four convolutions each for scores
     /// and boxes. In contrast to RetinaNet, locations have no anchors, and there are masks.
     pub fn retinanet(classes: usize) -> Self {

@@ -225,7 +225,7 @@ impl Recipe for ProposalsRecipe {
     ) -> Result<Prepared<DetectorTraining, Backgrounds>, TrainError> {
         let device = Device::flex().autodiff();
 
-        let config = DetectorConfig { shared: 2, own: 2, ..DetectorConfig::compact(1) };
+        let config = DetectorConfig::proposals();
         let encoder = Encoder::Lite0(imagenet_encoder(&device)?);
         let network = config.init_with(encoder, self.seed(), &device);
         let textures = self.backgrounds()?;
