@@ -159,13 +159,14 @@ pub struct Numbers {
     pub prototypes: Vec<f32>,
 }
 
-/// A box before suppression, in network pixels.
+/// A box before suppression.
 #[derive(Debug, Clone, Copy)]
 struct Candidate {
     class: usize,
     score: f32,
-    /// Left, top, right, bottom.
+    /// Left, top, right, bottom in pixels of the first scale.
     corners: [f32; 4],
+    scale: usize,
     level: usize,
     location: usize,
 }
@@ -217,17 +218,22 @@ fn voted(of: &Candidate, candidates: &[Candidate], most_overlap: f32) -> [f32; 4
     if weight > 0.0 { sum.map(|side| side / weight) } else { of.corners }
 }
 
-/// Detections in an image of `size` (columns, rows), best first.
-pub fn decode(
+/// Pixels of one scale in those of another whose pixels are `1 / ratio` times as large; a ratio of 1 changes nothing.
+fn rescaled(corners: [f32; 4], ratio: f32) -> [f32; 4] {
+    if ratio == 1.0 { corners } else { corners.map(|v| (v + 0.5) * ratio - 0.5) }
+}
+
+/// The boxes of one scale with at least the threshold's score, best first, in its own pixels.
+fn candidates(
     raw: &Numbers,
     image: &NetworkImage,
-    size: (usize, usize),
+    scale: usize,
     config: &DetectorConfig,
-    options: &DetectOptions,
-) -> Vec<Detected> {
-    /// Maximum number of candidates in the suppression.
+    threshold: f32,
+) -> Vec<Candidate> {
+    /// Maximum number of candidates of a scale.
     const MAX_CANDIDATES: usize = 2000;
-    let threshold = options.threshold.clamp(1e-4, 1.0 - 1e-6);
+    let threshold = threshold.clamp(1e-4, 1.0 - 1e-6);
     let min_logit = (threshold / (1.0 - threshold)).ln();
     let limits = image.filled.map(|side| side as f32 - 0.5);
     let mut candidates = vec![];
@@ -250,48 +256,44 @@ pub fn decode(
                 (y + far[3]).clamp(-0.5, limits[1]),
             ];
             if corners[2] - corners[0] >= 1.0 && corners[3] - corners[1] >= 1.0 {
-                candidates.push(Candidate { class, score: sigmoid(*logit), corners, level, location });
+                candidates.push(Candidate { class, score: sigmoid(*logit), corners, scale, level, location });
             }
         }
     }
     candidates.sort_by(|a, b| b.score.total_cmp(&a.score));
     candidates.truncate(MAX_CANDIDATES);
-    let to_image = |v: f32, last: usize| {
-        f64::from(((v + 0.5) * image.step - 0.5).clamp(0.0, last.saturating_sub(1) as f32))
-    };
-    suppress(candidates, options)
+    candidates
+}
+
+/// Detections in an image of `size` (columns, rows), best first, from the network's output at one or more scales. Boxes of all scales
+/// are suppressed together: one that is suppressed by a box that is itself suppressed would be lost.
+pub fn decode(
+    scales: &[(NetworkImage, Numbers)],
+    size: (usize, usize),
+    config: &DetectorConfig,
+    options: &DetectOptions,
+) -> Vec<Detected> {
+    let Some(first) = scales.first().map(|(image, _)| image.step) else { return vec![] };
+    let ratio = |scale: usize| scales[scale].0.step / first;
+    let all = scales.iter().enumerate().flat_map(|(scale, (image, raw))| {
+        let found = candidates(raw, image, scale, config, options.threshold);
+        found.into_iter().map(move |c| Candidate { corners: rescaled(c.corners, ratio(scale)), ..c })
+    });
+    let to_image =
+        |v: f32, last: usize| f64::from(((v + 0.5) * first - 0.5).clamp(0.0, last.saturating_sub(1) as f32));
+    suppress(all.collect(), options)
         .into_iter()
         .map(|c| {
             let [left, top, right, bottom] = c.corners;
             let (x, y) = (to_image(left, size.0), to_image(top, size.1));
             let bbox =
                 Rect { x, y, width: to_image(right, size.0) - x, height: to_image(bottom, size.1) - y };
-            let mask = options.masks.then(|| mask_of(raw, image, size, config, &c));
+            let mask = options.masks.then(|| {
+                let (image, raw) = &scales[c.scale];
+                let own = Candidate { corners: rescaled(c.corners, 1.0 / ratio(c.scale)), ..c };
+                mask_of(raw, image, size, config, &own)
+            });
             Detected { class: c.class, score: c.score, bbox, mask }
-        })
-        .collect()
-}
-
-/// The detections of several scales of an image, best first, suppressed as those of one are.
-pub(crate) fn merged(mut scales: Vec<Vec<Detected>>, options: &DetectOptions) -> Vec<Detected> {
-    if scales.len() == 1 {
-        return scales.remove(0);
-    }
-    let mut all: Vec<Option<Detected>> = scales.into_iter().flatten().map(Some).collect();
-    let candidate = |(location, d): (usize, &Option<Detected>)| {
-        let d = d.as_ref()?;
-        let (right, bottom) = (d.bbox.x + d.bbox.width, d.bbox.y + d.bbox.height);
-        let corners = [d.bbox.x, d.bbox.y, right, bottom].map(|v| v as f32);
-        Some(Candidate { class: d.class, score: d.score, corners, level: 0, location })
-    };
-    let candidates = all.iter().enumerate().filter_map(candidate).collect();
-    suppress(candidates, options)
-        .iter()
-        .filter_map(|c| {
-            let [left, top, right, bottom] = c.corners.map(f64::from);
-            let detected = all[c.location].take()?;
-            let bbox = Rect { x: left, y: top, width: right - left, height: bottom - top };
-            Some(if options.voting { Detected { bbox, ..detected } } else { detected })
         })
         .collect()
 }
@@ -351,7 +353,7 @@ mod tests {
     use super::*;
 
     fn candidate(class: usize, score: f32, corners: [f32; 4]) -> Candidate {
-        Candidate { class, score, corners, level: 0, location: 0 }
+        Candidate { class, score, corners, scale: 0, level: 0, location: 0 }
     }
 
     #[test]
@@ -389,27 +391,57 @@ mod tests {
         assert_eq!(corners(&DetectOptions { overlap: 1.0, ..options })[0], all[1].corners);
     }
 
+    /// An image of 128x128 pixels at the scale `step`, whose network finds one object at a location of the finest level: its score's
+    /// logit, column and row, and the distance of its four sides.
+    fn seen(step: f32, found: &[(f32, [usize; 2], f32)]) -> (NetworkImage, Numbers) {
+        let side = (128.0 / step) as usize;
+        let image = NetworkImage { values: vec![], width: side, height: side, filled: [side; 2], step };
+        let sizes = [8, 16, 32].map(|stride| (side / stride) * (side / stride));
+        let mut raw = Numbers {
+            scores: sizes.iter().map(|n| vec![-9.0; *n]).collect(),
+            boxes: sizes.iter().map(|n| vec![0.0; 6 * n]).collect(),
+            prototypes: vec![1.0; (side / 4) * (side / 4)],
+        };
+        for (logit, [column, row], far) in found {
+            let location = row * (side / 8) + column;
+            raw.scores[0][location] = *logit;
+            (0..4).for_each(|i| raw.boxes[0][i * sizes[0] + location] = (far / 8.0).ln());
+            raw.boxes[0][4 * sizes[0] + location] = 1.0;
+        }
+        (image, raw)
+    }
+
     #[test]
     fn detections_of_several_scales_are_suppressed_as_those_of_one() {
-        let found = |score: f32, x: f64| Detected {
-            class: 0,
-            score,
-            bbox: Rect { x, y: 0.0, width: 10.0, height: 10.0 },
-            mask: Some(Mask::filled(1, 1, score > 0.6)),
+        let config = DetectorConfig { prototypes: 1, ..DetectorConfig::compact(1) };
+        // At both scales an object around (35.5, 35.5), 32 pixels wide; at the coarser one it is 34 pixels wide. Another at each.
+        let scales = [
+            seen(1.0, &[(2.0, [4, 4], 16.0), (0.5, [12, 4], 16.0)]),
+            seen(2.0, &[(1.0, [2, 2], 8.5), (1.5, [6, 6], 8.0)]),
+        ];
+        let detect = |options: &DetectOptions| decode(&scales, (128, 128), &config, options);
+        let options = DetectOptions { overlap: 0.6, ..DetectOptions::default() };
+        let scores = |found: &[Detected]| found.iter().map(|d| (10.0 * d.score).round()).collect::<Vec<_>>();
+        let found = detect(&options);
+        assert_eq!(scores(&found), [9.0, 8.0, 6.0]);
+        let close = |d: &Detected, expected: [f64; 4]| {
+            let found = [d.bbox.x, d.bbox.y, d.bbox.width, d.bbox.height];
+            assert!(found.iter().zip(expected).all(|(f, e)| (f - e).abs() < 1e-3), "{found:?}");
         };
-        let scales = vec![vec![found(0.9, 0.0), found(0.5, 30.0)], vec![found(0.7, 1.0), found(0.6, 60.0)]];
-        let options = DetectOptions::default();
-        let merged_with = |options: &DetectOptions| merged(scales.clone(), options);
-        let all = merged_with(&options);
-        assert_eq!(all.iter().map(|d| d.score).collect::<Vec<_>>(), [0.9, 0.6, 0.5]);
-        assert!(all[0].mask.as_ref().unwrap()[(0, 0)] && !all[1].mask.as_ref().unwrap()[(0, 0)]);
-        assert_eq!(merged_with(&DetectOptions { max_detections: 2, ..options }).len(), 2);
-        assert_eq!(merged_with(&DetectOptions { overlap: 0.9, ..options }).len(), 4);
-        assert_eq!(merged(vec![scales[0].clone()], &options), scales[0]);
-        let voted = merged_with(&DetectOptions { voting: true, ..options });
-        let [x, mean] = [voted[0].bbox.x, 0.7 / 1.6];
-        assert!((x - mean).abs() < 1e-6 && (voted[0].bbox.width - 10.0).abs() < 1e-5, "{x}");
-        assert!(voted[0].mask == all[0].mask && voted[1].bbox.iou(&all[1].bbox) > 0.999);
+        close(&found[0], [19.5, 19.5, 32.0, 32.0]);
+        // Location (6, 6) of the coarser scale: its centre 51.5 is 103.5 in the image.
+        close(&found[1], [87.5, 87.5, 32.0, 32.0]);
+        // Its mask fills its box, read from the prototypes of its own scale.
+        let mask = found[1].mask.as_ref().unwrap();
+        let count = mask.as_slice().iter().filter(|inside| **inside).count();
+        assert!(mask[(103, 103)] && !mask[(80, 103)] && (32 * 32..36 * 36).contains(&count), "{count}");
+        assert_eq!(detect(&DetectOptions { max_detections: 2, ..options }).len(), 2);
+        assert_eq!(detect(&DetectOptions { overlap: 0.95, ..options }).len(), 4);
+        // With voting the boxes of both scales count: 19.5 to 51.5 with a score of 0.881, and 22.5 to 56.5 with 0.731.
+        let voted = &detect(&DetectOptions { voting: true, ..options });
+        assert_eq!(scores(voted), [9.0, 8.0, 6.0]);
+        close(&voted[0], [20.861, 20.861, 32.907, 32.907]);
+        close(&voted[1], [87.5, 87.5, 32.0, 32.0]);
         for scales in [0, MAX_SCALES + 1] {
             let message = DetectOptions { scales, ..options }.check().unwrap_err();
             assert!(message.contains("scales") && message.contains("1 to 7"), "{message}");
@@ -442,7 +474,7 @@ mod tests {
         for row in raw.prototypes.chunks_exact_mut(24) {
             row[..9].fill(1.0);
         }
-        let found = decode(&raw, &input, image.size(), &config, &DetectOptions::default());
+        let found = decode(&[(input, raw)], image.size(), &config, &DetectOptions::default());
         assert_eq!(found.len(), 1);
         let d = &found[0];
         assert_eq!(d.class, 1);

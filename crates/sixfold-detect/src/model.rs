@@ -2,7 +2,7 @@
 
 use crate::anchored::{AnchoredDetection, AnchoredKind, AnchoredNetwork, Thresholds};
 use crate::card::{anchored_kind, classes_of, read_anchored};
-use crate::detect::{DetectOptions, Detected, NetworkImage, Numbers, decode, merged};
+use crate::detect::{DetectOptions, Detected, NetworkImage, Numbers, decode};
 use crate::network::{Detector, DetectorConfig, EncoderKind};
 use crate::torchvision::{self, Torchvision};
 use burn::module::Module;
@@ -356,9 +356,10 @@ impl DetectorModel {
                     let side = (longest * SQRT_2.powi(-(scale as i32))).round() as usize;
                     let input =
                         NetworkImage::new(image, &network.config, side).ok_or(ModelError::EmptyImage)?;
-                    found.push(decode(&network.run(&input), &input, image.size(), &network.config, options));
+                    let numbers = network.run(&input);
+                    found.push((input, numbers));
                 }
-                Ok(merged(found, options))
+                Ok(decode(&found, image.size(), &network.config, options))
             }
             Network::Anchored(..) if image.size().0 == 0 || image.size().1 == 0 => {
                 Err(ModelError::EmptyImage)
