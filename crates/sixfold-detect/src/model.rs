@@ -224,6 +224,15 @@ impl DetectorModel {
         Ok(DetectorModel { network: anchorless(network, config, device), classes, usage, card })
     }
 
+    /// The encoder of a network without anchors.
+    #[cfg(test)]
+    pub(crate) fn encoder(&self) -> Option<&crate::network::Encoder> {
+        match &self.network {
+            Network::Anchorless(network) => Some(&network.network.encoder),
+            Network::Anchored(..) => None,
+        }
+    }
+
     /// The network of a weight file, for further training on `device` with the objects `ids` in this order.
     ///
     /// # Errors

@@ -235,6 +235,22 @@ fn placed(meshes: &[&Mesh], reach: f64, random: &mut Random) -> Vec<(usize, Pose
     out
 }
 
+/// The shadows of objects in each light that has a direction.
+fn shadows(
+    objects: &[SceneObject<'_>],
+    lights: &[Light],
+    centre: &Vec3,
+    radius: f64,
+) -> Vec<Option<ShadowMap>> {
+    let of = |light: &Light| match light {
+        Light::Directional { direction, .. } => {
+            ShadowMap::new(objects, direction, centre, radius, SHADOW_MAP)
+        }
+        _ => None,
+    };
+    lights.iter().map(of).collect()
+}
+
 /// Renders an image of `side` pixels of a table with some of `meshes`, which stand on z = 0 or are centred on the origin.
 pub(crate) fn tabletop(
     meshes: &[&Mesh],
@@ -295,16 +311,8 @@ pub(crate) fn tabletop(
     let background = textures.patch(side, side, random).to_rgb();
     let lights = lights(&camera_from_table, random);
     let centre = camera_from_table.translation();
-    let shadows: Vec<Option<ShadowMap>> = lights
-        .iter()
-        .map(|light| match light {
-            // Sheets and table have no shadow of their own.
-            Light::Directional { direction, .. } => {
-                ShadowMap::new(&objects[..count], direction, &centre, 2.0 * reach, SHADOW_MAP)
-            }
-            _ => None,
-        })
-        .collect();
+    // Sheets and table have no shadow of their own.
+    let shadows = shadows(&objects[..count], &lights, &centre, 2.0 * reach);
     let lit = |light: usize, point: &Vec3| shadows[light].as_ref().map_or(1.0, |s| s.visible(point));
     let material = random_material(random);
     let image = shade_in_shadows(&frame, &objects, &lights, &lit, &material, Some(&background));
@@ -365,13 +373,36 @@ mod tests {
             let Tabletop { image, labels, whole } =
                 tabletop(&[&tower], &textures, 96, &mut stream(5, number));
             assert_eq!(image.data.len(), 3 * labels.len());
-            for (index, pixels) in whole.iter().zip(1u8..).map(|((_, pixels), number)| (number, *pixels)) {
-                let visible = labels.iter().filter(|label| **label == index).count();
-                assert!(visible as f32 <= pixels, "{visible} of {pixels}");
+            for (number, (_, pixels)) in (1u8..).zip(&whole) {
+                let visible = labels.iter().filter(|label| **label == number).count();
+                assert!(visible as f32 <= *pixels, "{visible} of {pixels}");
                 seen += usize::from(visible > 0);
             }
             assert!(labels.iter().all(|label| usize::from(*label) <= whole.len()));
         }
         assert!(seen > 20, "{seen}");
+    }
+
+    #[test]
+    fn an_object_shades_the_table_below_it() {
+        let mut random = stream(0, 7);
+        let toy = sixfold_synth::shapes::toy(&mut random).unwrap();
+        let camera_from_table = looking_down(1.0, &mut random);
+        let objects = [SceneObject { mesh: &toy, camera_from_object: camera_from_table }];
+        let lights = lights(&camera_from_table, &mut random);
+        let shadows = shadows(&objects, &lights, &camera_from_table.translation(), 0.6);
+        assert_eq!(shadows.len(), lights.len());
+        // Points of the table, every centimetre, and how many of them each lamp does not reach.
+        let points: Vec<Vec3> = (0..80 * 80)
+            .map(|i| Vec3::new(0.01 * f64::from(i % 80) - 0.4, 0.01 * f64::from(i / 80) - 0.4, 0.0))
+            .map(|point| camera_from_table.transform_point(&point))
+            .collect();
+        let dark = |map: &ShadowMap| points.iter().filter(|point| map.visible(point) < 0.5).count();
+        // Ambient light has no shadow. That of a lamp is at least about as large as the toy's base, and not the whole table.
+        assert!(shadows[0].is_none());
+        for map in &shadows[1..] {
+            let dark = dark(map.as_ref().unwrap());
+            assert!((5..3000).contains(&dark), "{dark}");
+        }
     }
 }
