@@ -119,6 +119,7 @@ impl Detector {
             max_detections: whole("max_detections", max_detections, 1)?,
             scales: whole("scales", scales, 1)?,
             masks,
+            ..DetectOptions::default()
         };
         let model = self.model.clone();
         let found = interruptible(py, move |_| model.detect(&image, &options))?.map_err(about("rgb"))?;
