@@ -51,6 +51,16 @@ def test_finds_what_is_there(detector, rgb, boxes):
         assert rows.min() >= y - 1 and rows.max() <= y + height + 1
 
 
+def test_boxes_are_those_of_the_network_not_means(detector, rgb):
+    def boxes(overlap):
+        found = detector(rgb, threshold=0.05, overlap=overlap, per_object=1000, max_detections=1000, masks=False)
+        return {(d.object_id, *np.round(d.bbox, 3)) for d in found}
+
+    kept, every = boxes(0.5), boxes(1.0)
+    assert 0 < len(kept) < len(every)
+    assert kept <= every
+
+
 def test_poses_in_its_boxes(detector, rgb, demo, weights):
     dataset = bop.Dataset(demo)
     meshes = {i: dataset.model(i) for i in detector.object_ids}
