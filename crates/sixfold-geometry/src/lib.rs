@@ -24,6 +24,7 @@ mod pose;
 mod progress;
 pub mod random;
 mod solver;
+pub mod srgb;
 pub mod stats;
 mod undistort;
 

@@ -13,7 +13,7 @@ use gltf::buffer::Source;
 use gltf::mesh::Mode;
 use gltf::{Accessor, Document, Gltf, Primitive, Semantic};
 use nalgebra::{Matrix3, Matrix4};
-use sixfold_geometry::{RgbImage, Vec3};
+use sixfold_geometry::{RgbImage, Vec3, srgb};
 
 use crate::file::decode_texture;
 use crate::mesh::Parts;
@@ -188,15 +188,6 @@ fn percent_decoded(text: &str) -> String {
     String::from_utf8_lossy(&out).into_owned()
 }
 
-fn srgb_from_linear(linear: f32) -> f32 {
-    let linear = linear.clamp(0.0, 1.0);
-    if linear <= 0.003_130_8 { 12.92 * linear } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 }
-}
-
-fn linear_from_srgb(srgb: f32) -> f32 {
-    if srgb <= 0.040_45 { srgb / 12.92 } else { ((srgb + 0.055) / 1.055).powf(2.4) }
-}
-
 fn to_byte(value: f32) -> u8 {
     (value * 255.0).round() as u8
 }
@@ -332,7 +323,7 @@ impl Reader<'_> {
             normals.into_iter().map(move |n| cofactors * Vec3::from(n.map(f64::from))).collect()
         });
         let colors = colors.map(|colors: Vec<[f32; 3]>| {
-            colors.into_iter().map(|c| c.map(|c| to_byte(srgb_from_linear(c)))).collect()
+            colors.into_iter().map(|c| c.map(|c| to_byte(srgb::from_linear(c)))).collect()
         });
         // In the file, v points down from the top.
         let texcoords = texcoords.map(|t| {
@@ -380,13 +371,13 @@ impl Reader<'_> {
             return Ok(paint);
         }
         let paint = match image {
-            None => Paint::Color(factor.map(|f| to_byte(srgb_from_linear(f)))),
+            None => Paint::Color(factor.map(|f| to_byte(srgb::from_linear(f)))),
             Some(image) => {
                 let mut texture = self.texture(&image)?;
                 if factor != [1.0; 3] {
                     let tables = factor.map(|f| {
                         (0..=255u8)
-                            .map(|b| to_byte(srgb_from_linear(linear_from_srgb(f32::from(b) / 255.0) * f)))
+                            .map(|b| to_byte(srgb::from_linear(srgb::to_linear(f32::from(b) / 255.0) * f)))
                             .collect::<Vec<u8>>()
                     });
                     for pixel in texture.as_mut_slice() {

@@ -2,7 +2,7 @@
 //!
 //! Light is summed in linear colour and converted to sRGB at the end.
 
-use sixfold_geometry::{Image, RgbImage, Vec3};
+use sixfold_geometry::{Image, RgbImage, Vec3, srgb};
 
 use crate::outputs::surface_normal;
 use crate::raster::{SceneObject, VisibilityBuffer};
@@ -146,16 +146,11 @@ pub fn shade_in_shadows(
 }
 
 fn linear_table() -> [f32; 256] {
-    std::array::from_fn(|i| {
-        let c = i as f32 / 255.0;
-        if c <= 0.04045 { c / 12.92 } else { ((c + 0.055) / 1.055).powf(2.4) }
-    })
+    std::array::from_fn(|i| srgb::to_linear(i as f32 / 255.0))
 }
 
 fn to_srgb(c: f32) -> u8 {
-    let c = c.clamp(0.0, 1.0);
-    let s = if c <= 0.003_130_8 { 12.92 * c } else { 1.055 * c.powf(1.0 / 2.4) - 0.055 };
-    (s * 255.0).round() as u8
+    (srgb::from_linear(c) * 255.0).round() as u8
 }
 
 /// Bilinear sampling of a repeated texture in linear colour; `v` points up.

@@ -33,6 +33,8 @@ const DEPTHS: [f64; 8] = [0.0, 0.06, 0.12, 0.25, 0.4, 0.6, 0.8, 1.0];
 const CHANGES: [f64; 4] = [-0.1, -0.05, 0.05, 0.1];
 /// Radius of the narrowest part of a hollow, metres: anything narrower would be inside a handle.
 const NARROW: f64 = 0.008;
+/// Of this many masks, one may reach above the rim.
+const ONE_WRONG_OF: usize = 10;
 /// How far below the rim the hull is continued upwards, metres.
 const BELOW_RIM: f64 = 0.006;
 /// By how much the photographs have to agree better on a hollow than on the shape without it.
@@ -138,10 +140,13 @@ impl Standing {
     fn of(hull: &Grid, views: &[View], masks: &[Mask]) -> Option<Standing> {
         let [w, h, d] = hull.size;
         let area = w * h;
-        // The rim is the lowest plane that cuts nothing from the masks.
+        // The rim is the lowest plane that cuts nothing from the masks, except from the few that reach highest: a mask with a bulge
+        // would put the rim into the roof of the hull.
         let down = -Vec3::z();
         let allowed = views.iter().zip(masks).filter_map(|(view, mask)| allowed_by(hull, view, mask, &down));
-        let rim = -allowed.fold(f64::INFINITY, f64::min);
+        let mut heights: Vec<f64> = allowed.map(|height| -height).collect();
+        heights.sort_by(|a, b| b.total_cmp(a));
+        let rim = *heights.get(heights.len() / ONE_WRONG_OF)?;
         let lowest = hull.values.iter().position(|v| *v < 0.0)? / area;
         let low = hull.low.z + lowest as f64 * hull.step;
         if !(rim.is_finite() && rim > low) {

@@ -32,6 +32,7 @@ mod placed;
 mod posed_file;
 mod record;
 mod reduce;
+mod shading;
 mod shape;
 mod silhouette;
 pub mod simulation;

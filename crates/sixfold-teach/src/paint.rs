@@ -1,10 +1,11 @@
 //! The colours of a mesh from the photographs, and the fraction of its surface that none of them shows.
 
 use rayon::prelude::*;
-use sixfold_geometry::Vec3;
+use sixfold_geometry::{Vec3, srgb};
 use sixfold_mesh::Mesh;
 use sixfold_render::render_depth;
 
+use crate::shading::{Observation, colors_in_mean_light};
 use crate::view::{View, bilinear_rgb};
 
 /// How far a vertex may be behind the rendered surface and still count as visible, metres.
@@ -46,12 +47,12 @@ pub(crate) fn painted(mesh: &Mesh, views: &[View]) -> Painted {
     let depths: Vec<_> =
         views.par_iter().map(|v| render_depth(mesh, &v.camera_from_world, &v.camera)).collect();
     let normals = mesh.vertex_normals();
-    let colors: Vec<Option<[u8; 3]>> = (0..mesh.vertices().len())
+    let seen: Vec<Vec<Observation>> = (0..mesh.vertices().len())
         .into_par_iter()
         .map(|i| {
             let (point, normal) = (&mesh.vertices()[i], &normals[i]);
             let mut seen = vec![];
-            for (view, depth) in views.iter().zip(&depths) {
+            for (number, (view, depth)) in views.iter().zip(&depths).enumerate() {
                 let cosine = (view.eye - point).normalize().dot(normal);
                 let Some((pixel, z)) = view.project(point) else { continue };
                 let nearest = (pixel.x.round() as usize, pixel.y.round() as usize);
@@ -60,32 +61,24 @@ pub(crate) fn painted(mesh: &Mesh, views: &[View]) -> Painted {
                     continue;
                 }
                 if cosine > FLATTEST && front > 0.0 && z < front + BEHIND {
-                    seen.push((cosine * cosine, bilinear_rgb(&view.image, pixel.x, pixel.y)));
+                    let color = bilinear_rgb(&view.image, pixel.x, pixel.y);
+                    let color = Vec3::from(color.map(|c| f64::from(srgb::to_linear(c as f32 / 255.0))));
+                    seen.push(Observation { view: number, weight: cosine * cosine, color });
                 }
             }
-            median_color(&seen)
+            seen
         })
+        .collect();
+    let colors: Vec<Option<[u8; 3]>> = colors_in_mean_light(&seen, &normals, views.len())
+        .into_iter()
+        .map(|color| Some(color?.into()).map(|c: [f64; 3]| c.map(stored)))
         .collect();
     let unseen = unseen_fraction(mesh, &colors);
     Painted { colors: filled(mesh, colors), unseen }
 }
 
-/// The weighted median of each channel, which is robust to moving highlights and to single wrong photographs.
-fn median_color(seen: &[(f64, [f64; 3])]) -> Option<[u8; 3]> {
-    let total: f64 = seen.iter().map(|s| s.0).sum();
-    if seen.is_empty() {
-        return None;
-    }
-    Some(std::array::from_fn(|c| {
-        let mut values: Vec<(f64, f64)> = seen.iter().map(|(weight, color)| (color[c], *weight)).collect();
-        values.sort_by(|a, b| a.0.total_cmp(&b.0));
-        let mut sum = 0.0;
-        let weighted_median = values.iter().find(|(_, weight)| {
-            sum += weight;
-            sum >= 0.5 * total
-        });
-        weighted_median.or(values.last()).map_or(0, |(value, _)| value.round() as u8)
-    }))
+fn stored(linear: f64) -> u8 {
+    (255.0 * srgb::from_linear(linear as f32)).round() as u8
 }
 
 fn unseen_fraction(mesh: &Mesh, colors: &[Option<[u8; 3]>]) -> f64 {

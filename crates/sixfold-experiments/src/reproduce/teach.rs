@@ -257,8 +257,7 @@ fn measured(
     let camera = a.one_view.then_some(options.camera);
     let teaching = teaching(&files, a.photographs(), length, camera)?;
     let taught = teaching.mesh()?;
-    let noise = SymmetryOptions { noise: 0.004 * taught.diameter(), ..SymmetryOptions::default() };
-    let sure = sure_symmetries(&find_symmetries(&taught, &noise)?, true);
+    let sure = sure_symmetries(&teaching.symmetries()?, true);
     let seconds = start.elapsed().as_secs_f64();
     let of_truth = sure_symmetries(&find_symmetries(mesh, &SymmetryOptions::default())?, true);
     let facts = teaching.shape().context("no mesh was made")?;
