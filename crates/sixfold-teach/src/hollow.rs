@@ -411,14 +411,17 @@ mod tests {
         (0..16).map(view).unzip()
     }
 
+    fn hull_of(views: &[View], masks: &[Mask]) -> Grid {
+        let outlined: Vec<Outlined<'_>> = views.iter().zip(masks).map(|(v, m)| Outlined::new(v, m)).collect();
+        let volume = Volume { low: Vec3::new(-0.04, -0.04, -0.004), high: Vec3::new(0.04, 0.04, 0.1) };
+        let floor = sixfold_geometry::Plane { normal: Vec3::z(), offset: 0.0 };
+        hull(&outlined, &volume, 64, Some(floor))
+    }
+
     /// The hull of a mesh, and what is left of it after something was carved from it.
     fn both(mesh: &Mesh, carve: impl Fn(&mut Grid)) -> [Grid; 2] {
         let (views, masks) = views_of(mesh);
-        let outlined: Vec<Outlined<'_>> =
-            views.iter().zip(&masks).map(|(v, m)| Outlined::new(v, m)).collect();
-        let volume = Volume { low: Vec3::new(-0.04, -0.04, -0.004), high: Vec3::new(0.04, 0.04, 0.1) };
-        let floor = sixfold_geometry::Plane { normal: Vec3::z(), offset: 0.0 };
-        let hull = hull(&outlined, &volume, 64, Some(floor));
+        let hull = hull_of(&views, &masks);
         let mut carved = hull.clone();
         carve(&mut carved);
         let left = hollowed(carved, hull.clone(), &views, &masks);
@@ -440,6 +443,17 @@ mod tests {
             assert!(is_inside(&cup, 0.0335, z));
         }
         assert!(!is_inside(&cup, 0.033, 0.074), "nothing is above the rim");
+    }
+
+    #[test]
+    fn one_mask_with_a_bulge_does_not_raise_the_rim() {
+        let (views, mut masks) = views_of(&cup());
+        let rim = |masks: &[Mask]| Standing::of(&hull_of(&views, masks), &views, masks).unwrap().rim;
+        assert!((rim(&masks) - 0.07).abs() < 0.002, "{}", rim(&masks));
+        // Eight pixels upwards, from 35 degrees above the ground.
+        let mask = masks[4].clone();
+        masks[4] = Mask::from_fn(120, 120, |x, y| mask[(x, y)] || (y + 8 < 120 && mask[(x, y + 8)]));
+        assert!((rim(&masks) - 0.07).abs() < 0.002, "{}", rim(&masks));
     }
 
     #[test]
