@@ -1,4 +1,5 @@
-//! From an image to boxes: resizing and padding, decoding, non-maximum suppression, masks.
+//! From an image to boxes: resizing and padding, decoding, non-maximum suppression with box voting as an option (Gidaris and
+//! Komodakis 2015), masks.
 
 use crate::loss::{cell_centre, distance};
 use crate::network::{DetectorConfig, FINEST_STRIDE, MASK_STRIDE};
