@@ -251,18 +251,21 @@ def hundredths(number):
 
 def teach():
     taught = value("teach", "taught")
+    symmetries = ("symmetries", "symmetries_true")
     found = ("found", "found_with_true_mesh", "found_auto", "found_auto_with_true_mesh", "wrong_auto")
     body = [[row["name"].replace("_", " "), row["diameter_mm"], hundredths(row["camera_mm"]), Literal(f"{row['camera_deg']:.3f}"),
-             row["mask_iou"], hundredths(row["mesh_mm"]), hundredths(row["truth_mm"]), *(row[key] for key in found)]
+             row["mask_iou"], hundredths(row["mesh_mm"]), hundredths(row["truth_mm"]), *(sum(row[key]) for key in symmetries),
+             *(row[key] for key in found)]
             for row in taught["objects"]]
     body.append(["all", None, hundredths(taught["camera_mm_median"]), Literal(f"{taught['camera_deg_median']:.3f}"), None,
-                 hundredths(taught["mesh_mm_mean"]), hundredths(taught["truth_mm_mean"]), *(taught[key] for key in found)])
+                 hundredths(taught["mesh_mm_mean"]), hundredths(taught["truth_mm_mean"]), None, None, *(taught[key] for key in found)])
     return ["object", "diameter (mm)", "camera (mm)", "camera (degrees)", "mask IoU", "mesh to truth (mm)", "truth to mesh (mm)",
-            "depth: found of 5", "with the true mesh", "auto: found of 5", "with the true mesh", "reported, wrong"], body, ["teach"]
+            "symmetries", "of the true mesh", "depth: found of 5", "with the true mesh", "auto: found of 5", "with the true mesh",
+            "reported, wrong"], body, ["teach"]
 
 
 def teach_depth():
-    ways = [value("teach", key) for key in ("taught", "with_depth", "one_view")]
+    ways = [value("teach", "taught"), value("teach_depth", "with_depth"), value("teach_depth", "one_view")]
 
     def cells(name, of):
         found = [of(way) for way in ways]
@@ -272,7 +275,7 @@ def teach_depth():
     body = [cells(row["name"].replace("_", " "), lambda way, i=i: way["objects"][i]) for i, row in enumerate(ways[0]["objects"])]
     body.append(cells("all", lambda way: {**way, "mesh_mm": way["mesh_mm_mean"]}))
     return ["object", "mesh to truth (mm): photographs", "with depth", "one view", "found of 5: photographs", "with depth", "one view",
-            "the true mesh"], body, ["teach"]
+            "the true mesh"], body, ["teach", "teach_depth"]
 
 
 def ours(path):
