@@ -11,6 +11,11 @@ pub fn from_linear(linear: f32) -> f32 {
     if linear <= 0.003_130_8 { 12.92 * linear } else { 1.055 * linear.powf(1.0 / 2.4) - 0.055 }
 }
 
+/// The stored byte of linear light.
+pub fn to_byte(linear: f32) -> u8 {
+    (from_linear(linear) * 255.0).round() as u8
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -20,8 +25,9 @@ mod tests {
         for value in 0..=255u8 {
             let stored = f32::from(value) / 255.0;
             assert!((from_linear(to_linear(stored)) - stored).abs() < 1e-6);
+            assert_eq!(to_byte(to_linear(stored)), value);
         }
-        assert_eq!((255.0 * from_linear(0.5)).round(), 188.0);
+        assert_eq!(to_byte(0.5), 188);
         assert_eq!(from_linear(-1.0), 0.0);
         assert!((from_linear(2.0) - 1.0).abs() < 1e-6);
     }

@@ -188,10 +188,6 @@ fn percent_decoded(text: &str) -> String {
     String::from_utf8_lossy(&out).into_owned()
 }
 
-fn to_byte(value: f32) -> u8 {
-    (value * 255.0).round() as u8
-}
-
 struct Reader<'a> {
     file: &'a str,
     resources: Resources<'a>,
@@ -322,9 +318,8 @@ impl Reader<'_> {
         let normals = normals.map(|normals| {
             normals.into_iter().map(move |n| cofactors * Vec3::from(n.map(f64::from))).collect()
         });
-        let colors = colors.map(|colors: Vec<[f32; 3]>| {
-            colors.into_iter().map(|c| c.map(|c| to_byte(srgb::from_linear(c)))).collect()
-        });
+        let colors =
+            colors.map(|colors: Vec<[f32; 3]>| colors.into_iter().map(|c| c.map(srgb::to_byte)).collect());
         // In the file, v points down from the top.
         let texcoords = texcoords.map(|t| {
             t.into_iter()
@@ -371,13 +366,13 @@ impl Reader<'_> {
             return Ok(paint);
         }
         let paint = match image {
-            None => Paint::Color(factor.map(|f| to_byte(srgb::from_linear(f)))),
+            None => Paint::Color(factor.map(srgb::to_byte)),
             Some(image) => {
                 let mut texture = self.texture(&image)?;
                 if factor != [1.0; 3] {
                     let tables = factor.map(|f| {
                         (0..=255u8)
-                            .map(|b| to_byte(srgb::from_linear(srgb::to_linear(f32::from(b) / 255.0) * f)))
+                            .map(|b| srgb::to_byte(srgb::to_linear(f32::from(b) / 255.0) * f))
                             .collect::<Vec<u8>>()
                     });
                     for pixel in texture.as_mut_slice() {

@@ -140,17 +140,13 @@ pub fn shade_in_shadows(
                 color[k] += lit * power[k] * (diffuse * albedo[k] + highlight);
             }
         }
-        out.as_mut_slice()[index] = color.map(to_srgb);
+        out.as_mut_slice()[index] = color.map(srgb::to_byte);
     });
     out
 }
 
 fn linear_table() -> [f32; 256] {
     std::array::from_fn(|i| srgb::to_linear(i as f32 / 255.0))
-}
-
-fn to_srgb(c: f32) -> u8 {
-    (srgb::from_linear(c) * 255.0).round() as u8
 }
 
 /// Bilinear sampling of a repeated texture in linear colour; `v` points up.

@@ -92,12 +92,16 @@ impl Snapshot {
         Ok(Stored { record, symmetries, photographs: posed.len() })
     }
 
+    /// The noise of the surface as a fraction of the diameter.
+    fn noise(&self) -> f64 {
+        let mut used = self.photographs().iter().filter(|p| p.left_out.is_none() && !p.left_out_by_person);
+        let is_measured = self.has_given_mesh() || used.all(|p| p.depth.is_some());
+        if is_measured { NOISE_WITH_DEPTH } else { NOISE }
+    }
+
     /// No symmetry of an object seen from one side is sure: its other side was made from the seen one.
     fn symmetries_of(&self, mesh: &Mesh, diameter: f64) -> Vec<FoundSymmetry> {
-        let used = || self.photographs().iter().filter(|p| p.left_out.is_none() && !p.left_out_by_person);
-        let is_measured = self.has_given_mesh() || used().all(|p| p.depth.is_some());
-        let noise = if is_measured { NOISE_WITH_DEPTH } else { NOISE };
-        let options = SymmetryOptions { noise: noise * diameter, ..SymmetryOptions::default() };
+        let options = SymmetryOptions { noise: self.noise() * diameter, ..SymmetryOptions::default() };
         let found = find_symmetries(mesh, &options).unwrap_or_default();
         if self.shape().is_some_and(|shape| shape.one_side) { at_most_likely(found) } else { found }
     }
@@ -218,6 +222,53 @@ mod tests {
     use sixfold_geometry::Vec3;
 
     use super::*;
+
+    /// A teaching with photographs of these files of depth.
+    fn snapshot(depths: &[Option<&str>], given_mesh: Option<u64>) -> Snapshot {
+        let photograph = |depth: &Option<&str>| json!({"name": "a.jpg", "file": "000000.jpg", "depth": depth.map(|file| json!([file, 0.001]))});
+        let photographs: Vec<_> = depths.iter().map(photograph).collect();
+        let state = json!({
+            "version": 1, "ruler": null, "given_camera": null, "photographs": photographs, "located": null, "volume": null,
+            "shape": null, "given_mesh": given_mesh,
+        });
+        Snapshot { folder: PathBuf::from("teaching"), state: serde_json::from_value(state).unwrap() }
+    }
+
+    #[test]
+    fn less_noise_is_expected_of_measured_depth_and_of_a_given_mesh() {
+        let (plain, measured) = (None, Some("000000.png"));
+        assert_eq!(snapshot(&[plain, plain], None).noise(), NOISE);
+        assert_eq!(snapshot(&[plain, measured], None).noise(), NOISE);
+        assert_eq!(snapshot(&[measured, measured], None).noise(), NOISE_WITH_DEPTH);
+        assert_eq!(snapshot(&[plain, plain], Some(1)).noise(), NOISE_WITH_DEPTH);
+        let mut one_left_out = snapshot(&[plain, measured], None);
+        one_left_out.state.photographs[0].left_out = Some("blurred".to_owned());
+        assert_eq!(one_left_out.noise(), NOISE_WITH_DEPTH);
+    }
+
+    #[test]
+    fn a_ragged_cylinder_is_round_with_the_noise_of_photographs_only() {
+        // 48 sides, every second edge of which is pushed inwards by 2 % of the diameter.
+        let corner = |i: u32| {
+            let (side, level) = (i % 48, i / 48);
+            let radius = if side.is_multiple_of(2) { 0.035 } else { 0.0334 };
+            let angle = f64::from(side) / 48.0 * std::f64::consts::TAU;
+            Vec3::new(radius * angle.cos(), radius * angle.sin(), 0.0)
+                + Vec3::z() * if level == 0 { -0.02 } else { 0.02 }
+        };
+        let sides = (0..48).flat_map(|i| {
+            let (a, b) = (i, (i + 1) % 48);
+            [[a, b, b + 48], [a, b + 48, a + 48]]
+        });
+        let caps = (1..47).flat_map(|i| [[0, i + 1, i], [48, 48 + i, 48 + i + 1]]);
+        let mesh = Mesh::new((0..96).map(corner).collect(), sides.chain(caps).collect()).unwrap();
+        let round = |depth| {
+            let found = snapshot(&[depth], None).symmetries_of(&mesh, mesh.diameter());
+            let (_, continuous) = sure_symmetries(&found, true);
+            continuous.len()
+        };
+        assert_eq!([round(None), round(Some("000000.png"))], [1, 0]);
+    }
 
     #[test]
     fn symmetries_of_an_assumed_side_are_never_sure() {

@@ -13,7 +13,7 @@ use crate::grid::Grid;
 use crate::hollow::hollowed;
 use crate::hull::{Outlined, hull};
 use crate::one_side::{self, OneSide};
-use crate::paint::{centre, finer, painted};
+use crate::paint::{SeenVertices, centre, finer};
 use crate::placed::{PLACING_STEPS, placed};
 use crate::silhouette::{Cues, Segmenter, consensus, masks};
 use crate::standing::standing;
@@ -503,13 +503,14 @@ pub fn reconstruct(
     let mesh = surface(&fine.smoothed(0.8)).ok_or_else(no_object)?;
     step(progress, 3, SHAPE_STEPS)?;
     let mesh = simplify(&mesh, options.faces);
-    let paint = painted(&mesh, &views);
+    let seen = SeenVertices::new(&mesh, &views);
+    let (colors, unseen) = (seen.colors(), seen.unseen());
     let origin = centre(&mesh);
     let world_from_object = Pose::from_translation(origin);
     let mesh = mesh.transformed(&world_from_object.inverse());
-    let mesh = mesh.clone().with_colors(paint.colors).unwrap_or(mesh);
+    let mesh = mesh.clone().with_colors(colors).unwrap_or(mesh);
     step(progress, 4, SHAPE_STEPS)?;
-    Ok(Shape { mesh, world_from_object, unseen: paint.unseen, with_depth, one_side: one_side.is_some() })
+    Ok(Shape { mesh, world_from_object, unseen, with_depth, one_side: one_side.is_some() })
 }
 
 /// Progress of one part of several: it continues the count of the previous part.
@@ -550,9 +551,10 @@ pub(crate) fn lay(
     let mesh = if has_colors { given.clone() } else { finer(given, options.faces) };
     let views: Vec<View> =
         views_of(capture, &volume, options.fine_side, &used).into_iter().map(|(_, view)| view).collect();
-    let paint = painted(&mesh.transformed(&world_from_object), &views);
-    let mesh = if has_colors { mesh } else { mesh.clone().with_colors(paint.colors).unwrap_or(mesh) };
-    Ok(Shape { mesh, world_from_object, unseen: paint.unseen, with_depth: hull.with_depth, one_side: false })
+    let in_world = mesh.transformed(&world_from_object);
+    let seen = SeenVertices::new(&in_world, &views);
+    let mesh = if has_colors { mesh } else { mesh.clone().with_colors(seen.colors()).unwrap_or(mesh) };
+    Ok(Shape { mesh, world_from_object, unseen: seen.unseen(), with_depth: hull.with_depth, one_side: false })
 }
 
 /// Depth of views, measured or found by stereo comparison.
