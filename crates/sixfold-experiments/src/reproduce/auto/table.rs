@@ -2,7 +2,9 @@
 
 use std::fmt::Write;
 
+use rand::RngExt;
 use serde::Serialize;
+use sixfold_geometry::random::stream;
 
 use super::{Given, Search};
 
@@ -10,6 +12,8 @@ use super::{Given, Search};
 const BINS: usize = 10;
 /// Poses of at least this probability are reported.
 const REPORTED: f64 = 0.5;
+/// Draws for [`Row::error_by_chance`].
+const DRAWS: u64 = 1000;
 
 /// One bin of a reliability diagram.
 #[derive(Debug, Clone, Copy, Default, Serialize, PartialEq)]
@@ -40,6 +44,10 @@ pub(super) struct Row {
     pub accepted: f64,
     /// Expected calibration error of the best poses (Naeini et al. 2015, ten bins).
     pub expected_error: f64,
+    /// The same for exact probabilities: the mean over random draws in which each of these poses is right with its probability. It is
+    /// above 0 because a bin of few poses does not hold the expected number of right ones; a measured error like it shows no
+    /// miscalibration.
+    pub error_by_chance: f64,
     /// Area under the ROC curve of the best poses.
     pub auc: f64,
     /// Mean seconds per search.
@@ -74,18 +82,11 @@ fn row(given: Given, searches: &[Search]) -> Option<Row> {
     let reported = best.iter().filter(|(_, p, _)| *p >= REPORTED);
     let reported_right = reported.clone().filter(|(_, _, right)| *right).count();
     let accepted = reported.clone().filter(|(there, _, _)| !there).count();
-    let mut bins = vec![Bin::default(); BINS];
-    for (_, p, right) in &best {
-        let bin = &mut bins[((p * BINS as f64) as usize).min(BINS - 1)];
-        bin.poses += 1;
-        bin.probability += p;
-        bin.right += f64::from(u8::from(*right));
-    }
-    for bin in bins.iter_mut().filter(|b| b.poses > 0) {
-        bin.probability /= bin.poses as f64;
-        bin.right /= bin.poses as f64;
-    }
-    let error = |b: &Bin| fraction(b.poses, best.len()) * (b.probability - b.right).abs();
+    let bins = binned(best.iter().map(|(_, p, right)| (*p, *right)));
+    let drawn = |draw: u64| {
+        let mut random = stream(0, draw);
+        error(&binned(best.iter().map(|(_, p, _)| (*p, random.random::<f64>() < *p))))
+    };
     Some(Row {
         given,
         present,
@@ -94,11 +95,34 @@ fn row(given: Given, searches: &[Search]) -> Option<Row> {
         precision: fraction(reported_right, reported.count()),
         absent,
         accepted: fraction(accepted, absent),
-        expected_error: bins.iter().map(error).sum(),
+        expected_error: error(&bins),
+        error_by_chance: (0..DRAWS).map(drawn).sum::<f64>() / DRAWS as f64,
         auc: auc(&best),
         seconds: of.iter().map(|s| s.seconds).sum::<f64>() / of.len() as f64,
         bins,
     })
+}
+
+/// Poses, each with its probability and whether it is right, in ten bins of equal width.
+fn binned(poses: impl Iterator<Item = (f64, bool)>) -> Vec<Bin> {
+    let mut bins = vec![Bin::default(); BINS];
+    for (p, right) in poses {
+        let bin = &mut bins[((p * BINS as f64) as usize).min(BINS - 1)];
+        bin.poses += 1;
+        bin.probability += p;
+        bin.right += f64::from(u8::from(right));
+    }
+    for bin in bins.iter_mut().filter(|b| b.poses > 0) {
+        bin.probability /= bin.poses as f64;
+        bin.right /= bin.poses as f64;
+    }
+    bins
+}
+
+/// Expected calibration error of binned poses; 0 without poses.
+fn error(bins: &[Bin]) -> f64 {
+    let poses = bins.iter().map(|b| b.poses).sum::<usize>().max(1) as f64;
+    bins.iter().map(|b| b.poses as f64 * (b.probability - b.right).abs()).sum::<f64>() / poses
 }
 
 /// The probability that a right pose has a higher probability than a wrong one.
@@ -122,14 +146,14 @@ fn auc(best: &[(bool, f64, bool)]) -> f64 {
 /// The rows as a page of markdown.
 pub(super) fn markdown(whole: &Whole) -> String {
     let mut out = "| given | objects in the image | best pose right | of these at least 0.5 | right of those at least 0.5 | \
-                   objects not in the image | of these at least 0.5 | expected calibration error | AUC | s a search |\n\
-                   |---|---|---|---|---|---|---|---|---|---|\n"
+                   objects not in the image | of these at least 0.5 | expected calibration error | the same for exact probabilities | AUC | s a search |\n\
+                   |---|---|---|---|---|---|---|---|---|---|---|\n"
         .to_owned();
     for r in &whole.rows {
         // Writing to a string cannot fail.
         let _ = writeln!(
             out,
-            "| {} | {} | {:.3} | {:.3} | {:.3} | {} | {:.3} | {:.3} | {:.3} | {:.2} |",
+            "| {} | {} | {:.3} | {:.3} | {:.3} | {} | {:.3} | {:.3} | {:.3} | {:.3} | {:.2} |",
             r.given.name(),
             r.present,
             r.found,
@@ -138,6 +162,7 @@ pub(super) fn markdown(whole: &Whole) -> String {
             r.absent,
             r.accepted,
             r.expected_error,
+            r.error_by_chance,
             r.auc,
             r.seconds
         );
@@ -175,6 +200,15 @@ mod tests {
         // .05 in the bins of two poses, .65 in two of one, .75, .05 in one of one each.
         let expected = (2.0 * 0.05 + 0.65 + 0.65 + 0.75 + 0.05) / 6.0;
         assert!((r.expected_error - expected).abs() < 1e-9, "{}", r.expected_error);
+        // One bin of two poses, four of one.
+        let binomial = |n: i32, p: f64, choose: &[f64]| -> f64 {
+            let right = |k: i32| choose[k as usize] * p.powi(k) * (1.0 - p).powi(n - k);
+            (0..=n).map(|k| right(k) * (f64::from(k) - f64::from(n) * p).abs()).sum()
+        };
+        let one = |p| binomial(1, p, &[1.0, 1.0]);
+        let chance =
+            (binomial(2, 0.95, &[1.0, 2.0, 1.0]) + one(0.35) + one(0.65) + one(0.75) + one(0.05)) / 6.0;
+        assert!((r.error_by_chance - chance).abs() < 0.015, "{} {chance}", r.error_by_chance);
         // Seven of the nine pairs of a right and a wrong pose are in order.
         assert!((r.auc - 7.0 / 9.0).abs() < 1e-9);
         assert_eq!(r.seconds, 2.0);
