@@ -335,7 +335,7 @@ part_auto() {
     local scenes=OUT/auto-scenes
     simulate kinect
     by_depth kinect auto ""
-    typed "sixfold simulate-scenes --families all --members 2 --toys 10 --scenes 16 --views 1 --sensor xtion --seed 202 --no-masks --out $scenes"
+    typed "sixfold simulate-scenes --families all --members 2 --toys 10 --scenes 32 --views 1 --sensor xtion --seed 202 --no-masks --out $scenes"
     typed "sixfold reproduce auto --dataset $scenes --absent 6 --disturb --given depth --out OUT/auto-depth --json OUT/auto-depth.json"
     typed "sixfold reproduce auto --dataset data/demo --given depth both --out OUT/auto-demo --json OUT/auto-demo.json"
     freeze auto 202 simulated=auto-depth.json samples=auto-demo.json poses_kinect=auto-kinect.csv scores_kinect=auto-kinect.json
