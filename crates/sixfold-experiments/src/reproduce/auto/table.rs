@@ -1,4 +1,5 @@
-//! Statistics of all searches.
+//! Statistics of all searches: the calibration error of their probabilities (Naeini et al. 2015), and what exact probabilities would have
+//! (consistency resampling, Bröcker and Smith 2007).
 
 use std::fmt::Write;
 
@@ -200,14 +201,11 @@ mod tests {
         // .05 in the bins of two poses, .65 in two of one, .75, .05 in one of one each.
         let expected = (2.0 * 0.05 + 0.65 + 0.65 + 0.75 + 0.05) / 6.0;
         assert!((r.expected_error - expected).abs() < 1e-9, "{}", r.expected_error);
-        // One bin of two poses, four of one.
-        let binomial = |n: i32, p: f64, choose: &[f64]| -> f64 {
-            let right = |k: i32| choose[k as usize] * p.powi(k) * (1.0 - p).powi(n - k);
-            (0..=n).map(|k| right(k) * (f64::from(k) - f64::from(n) * p).abs()).sum()
-        };
-        let one = |p| binomial(1, p, &[1.0, 1.0]);
-        let chance =
-            (binomial(2, 0.95, &[1.0, 2.0, 1.0]) + one(0.35) + one(0.65) + one(0.75) + one(0.05)) / 6.0;
+        // Exactly: one bin of two poses, of which none, one or both are right, and four bins of one.
+        let one = |p: f64| 2.0 * p * (1.0 - p);
+        let two =
+            |p: f64| (1.0 - p).powi(2) * 2.0 * p + one(p) * (1.0 - 2.0 * p).abs() + p * p * 2.0 * (1.0 - p);
+        let chance = (two(0.95) + one(0.35) + one(0.65) + one(0.75) + one(0.05)) / 6.0;
         assert!((r.error_by_chance - chance).abs() < 0.015, "{} {chance}", r.error_by_chance);
         // Seven of the nine pairs of a right and a wrong pose are in order.
         assert!((r.auc - 7.0 / 9.0).abs() < 1e-9);
