@@ -176,9 +176,11 @@ def probability():
         for row in value("auto", path):
             given = {"both": "depth and colour"}.get(row["given"], row["given"])
             body.append([images, given, row["present"], row["found"], row["kept"], row["precision"], row["absent"],
-                         row["accepted"] if row["absent"] else None, row["expected_error"], row["error_by_chance"]])
+                         row["accepted"] if row["absent"] else None, row["at_once"]["accepted"] if row["absent"] else None,
+                         row["at_once"]["kept"], row["at_once"]["precision"], row["expected_error"], row["error_by_chance"]])
     return ["images", "given", "objects present", "best pose right", "right poses reported", "right among the reported",
-            "objects absent", "absent objects reported", "expected calibration error", "the same for exact probabilities"], body, ["auto"]
+            "objects absent", "absent objects reported", "the same, all searched at once", "right poses reported then", "right among those",
+            "expected calibration error", "the same for exact probabilities"], body, ["auto"]
 
 
 def new_poses():

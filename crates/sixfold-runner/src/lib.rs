@@ -18,6 +18,7 @@ pub use dataset::{DatasetEvent, DatasetRun, DatasetSummary, ImageResult, PosedOb
 pub use detection::{DetectionEvent, DetectionRun, DetectionSummary, FoundDetection, detections};
 pub use error::{OtherInput, OtherOptions, RunError, describe};
 pub use image::{FoundObject, FoundPose, ImageReport, ImageRun, depth_notes, without_overruled};
+pub use overruled::left_standing;
 pub use record::RunOptions;
 pub use regions::RegionSource;
 pub use table::pose_table;

@@ -9,7 +9,7 @@ const MOST: f64 = 0.5;
 
 /// Which of the poses in one image are kept: a pose is not, if most of its pixels (`mask`) belong to more probable poses. Poses
 /// without a probability or a mask are kept and take no pixels from others.
-pub(crate) fn left_standing(poses: &[&PoseEstimate]) -> Vec<bool> {
+pub fn left_standing(poses: &[&PoseEstimate]) -> Vec<bool> {
     let judged = |i: &usize| Some((poses[*i].probability?, poses[*i].mask.as_ref()?));
     let mut order: Vec<usize> = (0..poses.len()).filter(|i| judged(i).is_some()).collect();
     order.sort_by(|a, b| {

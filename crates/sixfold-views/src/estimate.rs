@@ -197,6 +197,7 @@ impl Views<'_> {
         let mut chosen: Vec<(Hypothesis, Rect)> = hypotheses[..close].iter().map(|h| (*h, *bbox)).collect();
         chosen.extend(self.by_print(prints.as_ref(), camera, 1));
         let closer = self.closer_all(chosen, prints.as_ref(), image, camera)?;
+        let closer = self.chosen(closer, bbox, image, camera)?;
         hypotheses.splice(..close, closer);
         Ok(Some(hypotheses))
     }

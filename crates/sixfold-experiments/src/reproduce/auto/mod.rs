@@ -3,6 +3,7 @@
 //!
 //! The results of every image are stored in `rows/`, so that an interrupted run can be resumed.
 
+mod mesh_error;
 mod picture;
 mod table;
 
@@ -17,15 +18,17 @@ use serde::{Deserialize, Serialize};
 use sixfold_align::{DepthOptions, PreparedDepth};
 use sixfold_auto::{AutoEstimator, AutoMembers, AutoObject, Calibration, Fit, Numbers};
 use sixfold_bop::{BopDataset, ModelPoints, Models, SceneImage, mssd};
-use sixfold_estimator::{Cache, Object, PoseEstimator, Query, downcast};
+use sixfold_estimator::{Cache, Object, PoseEstimate, PoseEstimator, Query, downcast};
 use sixfold_geometry::random::stream;
 use sixfold_geometry::{DepthImage, Pose, RgbImage};
 use sixfold_mesh::{Mesh, ModelInfo, Unit, read_mesh};
+use sixfold_runner::left_standing;
 use sixfold_shell::Outcome;
 use sixfold_shell::output::{JsonArguments, report, write_atomically};
 use sixfold_shell::progress::{Progress, check_interrupt};
 use sixfold_synth::augment::{ColorAugmentation, Patch};
 
+use self::mesh_error::with_error;
 use super::kept::{kept_or_made, same_inputs};
 
 pub(super) const AFTER_HELP: &str = "Examples:\n  \
@@ -61,6 +64,9 @@ pub(crate) struct ReproduceAutoArguments {
     /// Vary the colours as with other lights and cameras, for rendered images
     #[arg(long)]
     pub disturb: bool,
+    /// Search with meshes whose size along each axis is wrong by this standard deviation
+    #[arg(long, value_name = "FRACTION", default_value = "0", value_parser = mesh_error::parsed)]
+    pub mesh_error: f64,
     /// Run all methods, fit the probabilities to the results, and write them to this file
     #[arg(long, value_name = "FILE")]
     pub fit: Option<PathBuf>,
@@ -118,6 +124,9 @@ struct Search {
     present: bool,
     /// All poses found, the most probable first.
     poses: Vec<FoundPose>,
+    /// Whether the most probable pose is reported, but not when all these objects are searched at once: most of its pixels belong to a
+    /// more probable pose of another.
+    overruled: bool,
     seconds: f64,
 }
 
@@ -139,6 +148,7 @@ struct Inputs {
     strangers: Vec<String>,
     given: Vec<Given>,
     disturb: bool,
+    mesh_error: f64,
     ask_all: bool,
     without_views: bool,
     calibration: Option<String>,
@@ -166,6 +176,7 @@ pub(super) fn run(a: &ReproduceAutoArguments, json: &JsonArguments) -> Result<Ou
             strangers: a.strangers.iter().map(text_of).collect(),
             given: a.given.clone(),
             disturb: a.disturb,
+            mesh_error: a.mesh_error,
             ask_all: a.fit.is_some(),
             without_views: a.without_views,
             calibration: a.calibration.as_ref().map(text_of),
@@ -212,7 +223,7 @@ fn strangers(a: &ReproduceAutoArguments, auto: &AutoEstimator) -> Result<Vec<Kno
         let mesh = read_mesh(path, unit)?;
         let info = ModelInfo::of_mesh(&mesh);
         let name = path.display().to_string();
-        known.push(know(auto, name, None, (mesh.clone(), info), &mesh)?);
+        known.push(know(auto, name, None, (mesh.clone(), info.clone()), (&mesh, &info))?);
     }
     Ok(known)
 }
@@ -222,11 +233,11 @@ fn know(
     name: String,
     id: Option<u32>,
     (mesh, info): (Mesh, ModelInfo),
-    vertices: &Mesh,
+    (vertices, truth): (&Mesh, &ModelInfo),
 ) -> Result<Known> {
     let points = ModelPoints::new(vertices.vertices()).with_context(|| format!("{name}: no vertices"))?;
-    let symmetries = info.symmetry_poses(SYMMETRY_STEP);
-    let diameter = info.diameter;
+    let symmetries = truth.symmetry_poses(SYMMETRY_STEP);
+    let diameter = truth.diameter;
     let folder = Cache::of_user().of_mesh(&mesh, &info)?;
     let prepared = auto.prepare(&Object { id, folder, ..Object::of_mesh(name.clone(), mesh, info) })?;
     Ok(Known { prepared, points, symmetries, diameter, name })
@@ -270,8 +281,9 @@ fn of_dataset(
                     let mesh = dataset.model(*id, Models::Rendering)?;
                     let info = infos.0.get(id).cloned().unwrap_or_else(|| ModelInfo::of_mesh(&mesh));
                     let vertices = dataset.model(*id, Models::Evaluation)?;
-                    known
-                        .insert(*id, know(auto, format!("object {id}"), Some(*id), (mesh, info), &vertices)?);
+                    let used = with_error(mesh, info.clone(), a.mesh_error, (seed, u64::from(*id)))?;
+                    let name = format!("object {id}");
+                    known.insert(*id, know(auto, name, Some(*id), used, (&vertices, &info))?);
                 }
             }
             let mut rgb = scene.rgb(im_id)?;
@@ -323,7 +335,9 @@ fn search<'k>(
     let prepared = depth.map(|d| PreparedDepth::new(d, camera, &options)).transpose()?;
     let prepared: Option<Arc<PreparedDepth>> = prepared;
     let query = Query { rgb, depth: prepared.as_ref(), ..Query::new(camera) };
-    let mut searches = vec![];
+    let mut searches: Vec<Search> = vec![];
+    // The poses that would be reported, and the numbers of their searches.
+    let (mut reported, mut of): (Vec<PoseEstimate>, Vec<usize>) = (vec![], vec![]);
     for (id, known) in objects {
         check_interrupt("the results of finished images are kept; run the same command again to continue")?;
         let truths: Vec<Pose> = image
@@ -336,6 +350,14 @@ fn search<'k>(
         let object: &AutoObject = downcast(known.prepared.as_ref(), "auto")?;
         let found = auto.hypotheses(object, &query)?;
         let seconds = start.elapsed().as_secs_f64();
+        if let Some(best) = found.first().filter(|h| h.probability >= table::REPORTED) {
+            reported.push(PoseEstimate {
+                probability: Some(best.probability),
+                mask: Some(best.evidence.pixels.clone()),
+                ..best.estimate.clone()
+            });
+            of.push(searches.len());
+        }
         let right = |pose: &Pose| {
             let off = |t: &Pose| mssd(&known.points, pose, t, &known.symmetries);
             truths.iter().any(|t| off(t) < RIGHT * known.diameter)
@@ -349,7 +371,12 @@ fn search<'k>(
                 right: right(&h.estimate.camera_from_object),
             })
             .collect();
-        searches.push(Search { object: known.name.clone(), given, present: id.is_some(), poses, seconds });
+        let object = known.name.clone();
+        searches.push(Search { object, given, present: id.is_some(), poses, overruled: false, seconds });
+    }
+    let stands = left_standing(&reported.iter().collect::<Vec<_>>());
+    for (number, stands) in of.into_iter().zip(stands) {
+        searches[number].overruled = !stands;
     }
     Ok(searches)
 }

@@ -12,7 +12,7 @@ use super::{Given, Search};
 /// Bins of the reliability diagram.
 const BINS: usize = 10;
 /// Poses of at least this probability are reported.
-const REPORTED: f64 = 0.5;
+pub(super) const REPORTED: f64 = 0.5;
 /// Draws for [`Row::error_by_chance`].
 const DRAWS: u64 = 1000;
 
@@ -43,6 +43,9 @@ pub(super) struct Row {
     pub absent: usize,
     /// Fraction of these that is reported nevertheless.
     pub accepted: f64,
+    /// The three fractions when the objects of an image are searched at once, as by `sixfold estimate` with all of them: a pose most of
+    /// whose pixels belong to a more probable one is not reported.
+    pub at_once: AtOnce,
     /// Expected calibration error of the best poses (Naeini et al. 2015, ten bins).
     pub expected_error: f64,
     /// The same for exact probabilities: the mean over random draws in which each of these poses is right with its probability. It is
@@ -54,6 +57,17 @@ pub(super) struct Row {
     /// Mean seconds per search.
     pub seconds: f64,
     pub bins: Vec<Bin>,
+}
+
+/// What is reported when the objects of an image are searched at once.
+#[derive(Debug, Serialize)]
+pub(super) struct AtOnce {
+    /// As [`Row::kept`].
+    pub kept: f64,
+    /// As [`Row::precision`].
+    pub precision: f64,
+    /// As [`Row::accepted`].
+    pub accepted: f64,
 }
 
 /// All rows.
@@ -75,14 +89,21 @@ fn row(given: Given, searches: &[Search]) -> Option<Row> {
     }
     let fraction = |a: usize, b: usize| if b == 0 { 0.0 } else { a as f64 / b as f64 };
     // The best pose of each search: its probability and whether it is right.
-    let best: Vec<(bool, f64, bool)> =
-        of.iter().filter_map(|s| s.poses.first().map(|p| (s.present, p.probability, p.right))).collect();
+    let judged = |s: &Search| s.poses.first().map(|p| (s.present, p.probability, p.right));
+    let best: Vec<(bool, f64, bool)> = of.iter().filter_map(|s| judged(s)).collect();
     let present = of.iter().filter(|s| s.present).count();
     let absent = of.len() - present;
     let right = best.iter().filter(|(_, _, right)| *right).count();
-    let reported = best.iter().filter(|(_, p, _)| *p >= REPORTED);
-    let reported_right = reported.clone().filter(|(_, _, right)| *right).count();
-    let accepted = reported.clone().filter(|(there, _, _)| !there).count();
+    // Which fraction of the right poses is among these, which fraction of these is right, and which of the absent objects has one.
+    let fractions = |poses: &[(bool, f64, bool)]| {
+        let reported = poses.iter().filter(|(_, p, _)| *p >= REPORTED);
+        let reported_right = reported.clone().filter(|(_, _, right)| *right).count();
+        let accepted = reported.clone().filter(|(there, _, _)| !there).count();
+        let (kept, precision) = (fraction(reported_right, right), fraction(reported_right, reported.count()));
+        AtOnce { kept, precision, accepted: fraction(accepted, absent) }
+    };
+    let AtOnce { kept, precision, accepted } = fractions(&best);
+    let left: Vec<(bool, f64, bool)> = of.iter().filter(|s| !s.overruled).filter_map(|s| judged(s)).collect();
     let bins = binned(best.iter().map(|(_, p, right)| (*p, *right)));
     let drawn = |draw: u64| {
         let mut random = stream(0, draw);
@@ -92,10 +113,11 @@ fn row(given: Given, searches: &[Search]) -> Option<Row> {
         given,
         present,
         found: fraction(right, present),
-        kept: fraction(reported_right, right),
-        precision: fraction(reported_right, reported.count()),
+        kept,
+        precision,
         absent,
-        accepted: fraction(accepted, absent),
+        accepted,
+        at_once: fractions(&left),
         expected_error: error(&bins),
         error_by_chance: (0..DRAWS).map(drawn).sum::<f64>() / DRAWS as f64,
         auc: auc(&best),
@@ -148,13 +170,13 @@ fn auc(best: &[(bool, f64, bool)]) -> f64 {
 pub(super) fn markdown(whole: &Whole) -> String {
     let mut out = "| given | objects in the image | best pose right | of these at least 0.5 | right of those at least 0.5 | \
                    objects not in the image | of these at least 0.5 | expected calibration error | the same for exact probabilities | AUC | s a search |\n\
-                   |---|---|---|---|---|---|---|---|---|---|---|\n"
+                   |---|---|---|---|---|---|---|---|---|---|---|---|---|---|\n"
         .to_owned();
     for r in &whole.rows {
         // Writing to a string cannot fail.
         let _ = writeln!(
             out,
-            "| {} | {} | {:.3} | {:.3} | {:.3} | {} | {:.3} | {:.3} | {:.3} | {:.3} | {:.2} |",
+            "| {} | {} | {:.3} | {:.3} | {:.3} | {} | {:.3} | {:.3} | {:.3} | {:.3} | {:.3} | {:.3} | {:.3} | {:.2} |",
             r.given.name(),
             r.present,
             r.found,
@@ -162,6 +184,9 @@ pub(super) fn markdown(whole: &Whole) -> String {
             r.precision,
             r.absent,
             r.accepted,
+            r.at_once.kept,
+            r.at_once.precision,
+            r.at_once.accepted,
             r.expected_error,
             r.error_by_chance,
             r.auc,
@@ -179,7 +204,7 @@ mod tests {
     fn search(present: bool, probability: f64, right: bool) -> Search {
         let numbers = [None; sixfold_auto::NAMES.len()];
         let poses = vec![FoundPose { method: "ppf".into(), numbers, probability, right }];
-        Search { object: "a".into(), given: Given::Depth, present, poses, seconds: 2.0 }
+        Search { object: "a".into(), given: Given::Depth, present, poses, overruled: false, seconds: 2.0 }
     }
 
     #[test]
@@ -198,6 +223,21 @@ mod tests {
         assert_eq!((whole.rows.len(), r.present, r.absent), (1, 5, 2));
         assert_eq!((r.found, r.kept, r.accepted), (0.6, 2.0 / 3.0, 0.5));
         assert_eq!(r.precision, 0.5);
+        assert_eq!((r.at_once.kept, r.at_once.precision, r.at_once.accepted), (2.0 / 3.0, 0.5, 0.5));
+        // The absent object's pose has the pixels of a more probable one, and so has a right one.
+        let overruled = |k: &usize| [0, 4].contains(k);
+        let (mut fewer, others): (Vec<_>, Vec<_>) = (0..).zip(searches).partition(|(k, _)| overruled(k));
+        fewer.iter_mut().for_each(|(_, s)| s.overruled = true);
+        let fewer: Vec<Search> = fewer.into_iter().chain(others).map(|(_, s)| s).collect();
+        let again = &Whole::of(&fewer).rows[0];
+        assert_eq!(
+            (again.kept, again.accepted, again.expected_error),
+            (r.kept, r.accepted, r.expected_error)
+        );
+        assert_eq!(
+            (again.at_once.kept, again.at_once.precision, again.at_once.accepted),
+            (1.0 / 3.0, 0.5, 0.0)
+        );
         // .05 in the bins of two poses, .65 in two of one, .75, .05 in one of one each.
         let expected = (2.0 * 0.05 + 0.65 + 0.65 + 0.75 + 0.05) / 6.0;
         assert!((r.expected_error - expected).abs() < 1e-9, "{}", r.expected_error);
