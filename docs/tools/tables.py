@@ -179,8 +179,8 @@ def probability():
                          row["accepted"] if row["absent"] else None, row["at_once"]["accepted"] if row["absent"] else None,
                          row["at_once"]["kept"], row["at_once"]["precision"], row["expected_error"], row["error_by_chance"]])
     return ["images", "given", "objects present", "best pose right", "right poses reported", "right among the reported",
-            "objects absent", "absent objects reported", "the same, all searched at once", "right poses reported then", "right among those",
-            "expected calibration error", "the same for exact probabilities"], body, ["auto"]
+            "objects absent", "absent objects reported", "absent objects reported, all searched at once", "right poses reported, all at once",
+            "right among the reported, all at once", "expected calibration error", "the same for exact probabilities"], body, ["auto"]
 
 
 def new_poses():

@@ -160,9 +160,9 @@ impl PoseEstimator for ViewsEstimator {
         Needs { depth: Need::Unused, rgb: Need::Required, region, object: Need::Required }
     }
 
-    /// Of the poses on the 100 LM-O development frames (ground-truth boxes) 69 % have a confidence above 0.4, including 90 % of
-    /// those with an MSSD below a fifth of the diameter; 94 % of the poses above have an MSSD below half the diameter, of all poses
-    /// 74 % (`benches/views_confidence.py`).
+    /// Of the poses on the 100 LM-O development frames (ground-truth boxes) 71 % have a confidence above 0.4, including 93 % of
+    /// those with an MSSD below a fifth of the diameter; 93 % of the poses above have an MSSD below half the diameter, of all poses
+    /// 76 % (`benches/views_confidence.py`).
     fn min_confidence(&self) -> MinConfidence {
         MinConfidence { image: 0.4, dataset: 0.0 }
     }
