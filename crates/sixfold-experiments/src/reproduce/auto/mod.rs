@@ -64,9 +64,9 @@ pub(crate) struct ReproduceAutoArguments {
     /// Vary the colours as with other lights and cameras, for rendered images
     #[arg(long)]
     pub disturb: bool,
-    /// Search with meshes whose size along each axis is wrong by this standard deviation
-    #[arg(long, value_name = "FRACTION", default_value = "0", value_parser = mesh_error::parsed)]
-    pub mesh_error: f64,
+    /// Search with meshes whose size along each axis is wrong by this standard deviation; once with each
+    #[arg(long, value_name = "FRACTION", num_args = 1.., default_value = "0", value_parser = mesh_error::parsed)]
+    pub mesh_error: Vec<f64>,
     /// Run all methods, fit the probabilities to the results, and write them to this file
     #[arg(long, value_name = "FILE")]
     pub fit: Option<PathBuf>,
@@ -148,7 +148,7 @@ struct Inputs {
     strangers: Vec<String>,
     given: Vec<Given>,
     disturb: bool,
-    mesh_error: f64,
+    mesh_error: Vec<f64>,
     ask_all: bool,
     without_views: bool,
     calibration: Option<String>,
@@ -176,7 +176,7 @@ pub(super) fn run(a: &ReproduceAutoArguments, json: &JsonArguments) -> Result<Ou
             strangers: a.strangers.iter().map(text_of).collect(),
             given: a.given.clone(),
             disturb: a.disturb,
-            mesh_error: a.mesh_error,
+            mesh_error: a.mesh_error.clone(),
             ask_all: a.fit.is_some(),
             without_views: a.without_views,
             calibration: a.calibration.as_ref().map(text_of),
@@ -192,7 +192,9 @@ pub(super) fn run(a: &ReproduceAutoArguments, json: &JsonArguments) -> Result<Ou
     let strangers = strangers(a, &auto)?;
     let mut searches: Vec<Search> = vec![];
     for (number, root) in a.dataset.iter().enumerate() {
-        searches.extend(of_dataset(a, &auto, &strangers, number, root)?);
+        for (pass, error) in a.mesh_error.iter().enumerate() {
+            searches.extend(of_dataset(a, &auto, &strangers, [number, pass], *error, root)?);
+        }
     }
     if let Some(file) = &a.fit {
         let fitted = fitted(&searches)?;
@@ -243,12 +245,13 @@ fn know(
     Ok(Known { prepared, points, symmetries, diameter, name })
 }
 
-/// All searches in the images of a dataset.
+/// All searches in the images of dataset `number`; `pass` counts the errors of meshes.
 fn of_dataset(
     a: &ReproduceAutoArguments,
     auto: &AutoEstimator,
     strangers: &[Known],
-    number: usize,
+    [number, pass]: [usize; 2],
+    mesh_error: f64,
     root: &std::path::Path,
 ) -> Result<Vec<Search>> {
     let dataset = BopDataset::open(root, &a.split)?;
@@ -265,7 +268,8 @@ fn of_dataset(
     let mut searches = vec![];
     for (scene_id, im_id) in images {
         check_interrupt("the results of finished images are kept; run the same command again to continue")?;
-        let key = format!("{number}-{scene_id:06}-{im_id:06}");
+        let name = if pass == 0 { number.to_string() } else { format!("{number}-error{pass}") };
+        let key = format!("{name}-{scene_id:06}-{im_id:06}");
         let scene = dataset.scene(scene_id)?;
         let image = scene.image(im_id)?;
         let made: Vec<Search> = kept_or_made(&a.out, &key, || {
@@ -281,7 +285,7 @@ fn of_dataset(
                     let mesh = dataset.model(*id, Models::Rendering)?;
                     let info = infos.0.get(id).cloned().unwrap_or_else(|| ModelInfo::of_mesh(&mesh));
                     let vertices = dataset.model(*id, Models::Evaluation)?;
-                    let used = with_error(mesh, info.clone(), a.mesh_error, (seed, u64::from(*id)))?;
+                    let used = with_error(mesh, info.clone(), mesh_error, (seed, u64::from(*id)))?;
                     let name = format!("object {id}");
                     known.insert(*id, know(auto, name, Some(*id), used, (&vertices, &info))?);
                 }
