@@ -1,5 +1,7 @@
 //! `sixfold reproduce auto`.
 
+use sixfold_auto::NAMES;
+
 use crate::support::*;
 
 #[test]
@@ -29,6 +31,28 @@ fn probabilities_are_fitted_checked_and_kept() {
         sixfold(dir, &format!("{check} --calibration fitted.json --out check --json")).expect(0).json();
     assert!(checked["rows"][0]["absent"].as_u64().unwrap() > 0, "{checked}");
     assert_eq!(checked["rows"][0]["present"], row["present"]);
+    // The stranger is a copy of an object that the images show: where both are reported, one pose has the other's pixels.
+    let reported =
+        |row: &serde_json::Value| row["kept"].as_f64().unwrap() + row["accepted"].as_f64().unwrap();
+    let alone = &checked["rows"][0];
+    assert!(reported(&alone["at_once"]) < reported(alone), "{alone}");
+
+    // With exact meshes and with wrong ones: every object is searched twice.
+    let twice = sixfold(dir, &fit.replace("--out fit ", "--mesh-error 0 0.1 --out twice ")).expect(0).json();
+    let twice = &twice["rows"][0];
+    assert_eq!(twice["present"].as_u64().unwrap(), 2 * row["present"].as_u64().unwrap());
+    let total = NAMES.iter().position(|name| *name == "total").unwrap();
+    let mut agreement = [0.0; 2];
+    for row in std::fs::read_dir(dir.join("twice/rows")).unwrap().map(Result::unwrap) {
+        let wrong = row.file_name().to_string_lossy().starts_with("0-error1-");
+        let searches: serde_json::Value =
+            serde_json::from_str(&std::fs::read_to_string(row.path()).unwrap()).unwrap();
+        for search in searches.as_array().unwrap() {
+            agreement[usize::from(wrong)] += search["poses"][0]["numbers"][total].as_f64().unwrap();
+        }
+    }
+    assert!(agreement[1] < agreement[0] - 0.1, "{agreement:?}");
+    fails(dir, &format!("{fit} --mesh-error 0.5"), &["--mesh-error", "0 to 0.1"]);
 
     fails(dir, &format!("{check} --calibration none.json --out x"), &["none.json"]);
     std::fs::write(dir.join("broken.json"), "{}").unwrap();
