@@ -1,7 +1,6 @@
 //! Meshes whose size is slightly off, as those of scanned objects are: without depth, a mesh that is two hundredths too large is found
 //! two hundredths of the distance too far away, however well its outline fits.
 
-use anyhow::Result;
 use sixfold_geometry::Vec3;
 use sixfold_geometry::random::{normal, stream};
 use sixfold_mesh::{Mesh, MeshError, ModelInfo};

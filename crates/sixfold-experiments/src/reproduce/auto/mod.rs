@@ -64,7 +64,7 @@ pub(crate) struct ReproduceAutoArguments {
     /// Vary the colours as with other lights and cameras, for rendered images
     #[arg(long)]
     pub disturb: bool,
-    /// Search with meshes whose size along each axis is wrong by this standard deviation; once with each
+    /// Search with meshes of the datasets whose size along each axis is wrong by this standard deviation; once with each
     #[arg(long, value_name = "FRACTION", num_args = 1.., default_value = "0", value_parser = mesh_error::parsed)]
     pub mesh_error: Vec<f64>,
     /// Run all methods, fit the probabilities to the results, and write them to this file
