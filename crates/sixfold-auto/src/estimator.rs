@@ -150,7 +150,7 @@ impl AutoEstimator {
             given => given.map(|(image, _)| image),
         };
         let gradients = color.map(|image| {
-            let kept: Arc<OnceLock<ColorGradients>> = query.memo.get_or_default();
+            let kept: Arc<OnceLock<ColorGradients>> = query.image_memo.get_or_default();
             kept.get_or_init(|| ColorGradients::new(image));
             (image, kept)
         });

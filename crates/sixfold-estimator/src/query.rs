@@ -10,8 +10,8 @@ use sixfold_geometry::{Camera, OptionError, RgbImage};
 use crate::error::EstimatorError;
 use crate::region::Region;
 
-/// Data that methods compute once per query and use for every object that is searched in it, by type. A clone shares the same
-/// memo.
+/// Data that methods compute once per query, or once per image, and use for every object that is searched in it, by type. A clone
+/// shares the same memo.
 #[derive(Default, Clone)]
 pub struct Memo(Arc<Mutex<Kept>>);
 
@@ -53,8 +53,10 @@ pub struct Query<'a> {
     pub min_confidence: f64,
     /// Whether images for people are wanted.
     pub diagnostics: bool,
-    /// Data that methods share between objects.
+    /// Data of the image and the region that methods share between objects.
     pub memo: Memo,
+    /// Data of the image alone, which queries of other regions of the same image can share.
+    pub image_memo: Memo,
     /// What [`Query::depth_region`] returns.
     #[doc(hidden)]
     pub depth_region: Arc<OnceLock<Result<DepthRegion, PreparedDepthError>>>,
@@ -74,6 +76,7 @@ impl<'a> Query<'a> {
             min_confidence,
             diagnostics: self.diagnostics,
             memo: self.memo.clone(),
+            image_memo: self.image_memo.clone(),
             depth_region: self.depth_region.clone(),
         }
     }
@@ -89,6 +92,7 @@ impl<'a> Query<'a> {
             min_confidence: 0.0,
             diagnostics: false,
             memo: Memo::default(),
+            image_memo: Memo::default(),
             depth_region: Arc::default(),
         }
     }

@@ -11,7 +11,7 @@ use serde::Serialize;
 use sixfold_align::PreparedDepth;
 use sixfold_bop::{BopDataset, Estimate, Models, ResultsAppender, Scene, Target};
 use sixfold_estimator::{
-    Cache, EstimatorError, Need, Object, PoseEstimate, PoseEstimator, PreparedObject, Query, Region,
+    Cache, EstimatorError, Memo, Need, Object, PoseEstimate, PoseEstimator, PreparedObject, Query, Region,
     check_min_confidence,
 };
 use sixfold_geometry::{Camera, RgbImage};
@@ -337,7 +337,7 @@ impl DatasetRun<'_> {
             let advice = "simulate its depth with `sixfold simulate-depth`";
             return Err(EstimatorError::Input { what: "image, of depth or of colour", method, advice }.into());
         }
-        Ok(Input { camera, rgb, depth })
+        Ok(Input { camera, rgb, depth, memo: Memo::default() })
     }
 }
 
@@ -346,6 +346,8 @@ struct Input {
     camera: Camera,
     rgb: Option<RgbImage>,
     depth: Option<Arc<PreparedDepth>>,
+    /// What methods keep of the image, for all targets in it.
+    memo: Memo,
 }
 
 impl Input {
@@ -355,6 +357,7 @@ impl Input {
             depth: self.depth.as_ref(),
             region,
             min_confidence,
+            image_memo: self.memo.clone(),
             ..Query::new(&self.camera)
         }
     }
@@ -411,4 +414,21 @@ fn keep_finished(path: &Path, record: &RunRecord) -> std::io::Result<()> {
     };
     let kept: String = text.split_inclusive('\n').filter(finished).collect();
     write_atomically(path, kept.as_bytes())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn queries_of_one_image_share_what_depends_on_the_image_alone() {
+        let camera = Camera::new(300.0, 300.0, 159.5, 119.5, 320, 240).unwrap();
+        let input = Input { camera, rgb: None, depth: None, memo: Memo::default() };
+        let (a, b) = (input.query(None, 0.0), input.query(None, 0.0));
+        let kept = |memo: &Memo| memo.get_or_default::<Vec<u8>>();
+        assert!(Arc::ptr_eq(&kept(&a.image_memo), &kept(&b.image_memo)));
+        assert!(!Arc::ptr_eq(&kept(&a.memo), &kept(&b.memo)));
+        let other = a.passed_on(2, 0.5);
+        assert!(Arc::ptr_eq(&kept(&a.image_memo), &kept(&other.image_memo)));
+    }
 }

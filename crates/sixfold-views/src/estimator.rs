@@ -212,7 +212,7 @@ impl PoseEstimator for ViewsEstimator {
             options: &self.options,
         };
         let keypoints = (!object.printed.views.is_empty())
-            .then(|| query.memo.get_or_default::<KeptKeypoints>().of_image(image));
+            .then(|| query.image_memo.get_or_default::<KeptKeypoints>().of_image(image));
         let keypoints = keypoints.as_deref();
         let estimate = |pose: &Hypothesis, score: f64| {
             let confidence = pose.similarity.clamp(0.0, 1.0) * score;
@@ -230,7 +230,7 @@ impl PoseEstimator for ViewsEstimator {
                 advice: "give --detector FILE.safetensors, --boxes, --box X,Y,W,H or --mask FILE",
             })?;
             let sizes = [self.options.proposals, self.options.side];
-            let kept: Arc<Places> = query.memo.get_or_default();
+            let kept: Arc<Places> = query.image_memo.get_or_default();
             let places = kept.of_image(proposals, &self.extractor, image, query.camera, sizes)?;
             let found = views.search(image, query.camera, &places, keypoints, query.max_instances);
             return Ok(found
