@@ -55,7 +55,7 @@ pub struct Query<'a> {
     pub diagnostics: bool,
     /// Data of the image and the region that methods share between objects.
     pub memo: Memo,
-    /// Data of the image alone, which queries of other regions of the same image can share.
+    /// Data of the image and its camera alone: queries of other regions of the same image can share it.
     pub image_memo: Memo,
     /// What [`Query::depth_region`] returns.
     #[doc(hidden)]
