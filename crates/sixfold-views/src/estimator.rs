@@ -298,7 +298,9 @@ mod tests {
         let estimator = estimator.with_proposals(detector.clone());
         assert_eq!(estimator.needs().region, Need::Optional);
         for _ in 0..2 {
-            let found = estimator.estimate(prepared.as_ref(), &query).unwrap();
+            let image_memo = query.image_memo.clone();
+            let again = Query { rgb: Some(&image), image_memo, ..Query::new(&camera) };
+            let found = estimator.estimate(prepared.as_ref(), &again).unwrap();
             assert_eq!(found.len(), 1);
             let pose = found[0].camera_from_object;
             assert!(pose.distance_to(&truth) < 0.05, "{pose:?} instead of {truth:?}");
