@@ -6,6 +6,7 @@
 
 mod dense;
 mod depthwise;
+mod direct;
 mod gather;
 mod lstm;
 mod roi_align;
@@ -23,6 +24,7 @@ pub(crate) use upsample::{upsample_2x, upsample_2x_backward};
 
 use dense::{dense_backward, dense_forward};
 use depthwise::{depthwise_backward, depthwise_forward};
+use direct::direct_forward;
 
 /// Sizes of one convolution: `x` is `batch x inputs x height x width`, the weights are
 /// `outputs x inputs / groups x kernel x kernel`.
@@ -73,7 +75,8 @@ pub(crate) fn conv_forward(
     spec: &ConvSpec,
 ) -> Vec<f32> {
     if spec.groups == 1 {
-        dense_forward(x, weight, bias, shape, spec)
+        direct_forward(x, weight, bias, shape, spec)
+            .unwrap_or_else(|| dense_forward(x, weight, bias, shape, spec))
     } else {
         depthwise_forward(x, weight, bias, shape, spec)
     }
