@@ -93,6 +93,14 @@ pub fn shade_in_shadows(
         None => Image::filled(frame.width(), frame.height(), [0; 3]),
     };
     let to_linear = linear_table();
+    // Towards each directional light, which is the same for all pixels; `None` for one without a direction.
+    let towards: Vec<Option<Vec3>> = lights
+        .iter()
+        .map(|light| match light {
+            Light::Directional { direction, .. } => (-direction).try_normalize(1e-12),
+            Light::Ambient { .. } | Light::Point { .. } => None,
+        })
+        .collect();
     frame.for_surfaces(objects, |index, point, object, face, weights, corners| {
         let mesh = objects[object].mesh;
         let f = mesh.faces()[face];
@@ -108,7 +116,6 @@ pub fn shade_in_shadows(
             material.plain.map(|c| to_linear[c as usize])
         };
         let normal = surface_normal(&objects[object], face, weights, corners, &point);
-        let view = -point.normalize();
         let mut color = [0.0f32; 3];
         for (number, light) in lights.iter().enumerate() {
             let (towards, power) = match light {
@@ -118,8 +125,8 @@ pub fn shade_in_shadows(
                     }
                     continue;
                 }
-                Light::Directional { direction, color } => {
-                    let Some(d) = (-direction).try_normalize(1e-12) else { continue };
+                Light::Directional { color, .. } => {
+                    let Some(d) = towards[number] else { continue };
                     (d, *color)
                 }
                 Light::Point { position, color } => {
@@ -130,7 +137,7 @@ pub fn shade_in_shadows(
             };
             let diffuse = normal.dot(&towards).max(0.0) as f32;
             let highlight = if material.specular > 0.0 && diffuse > 0.0 {
-                let half = (towards + view).try_normalize(1e-12).unwrap_or(normal);
+                let half = (towards - point.normalize()).try_normalize(1e-12).unwrap_or(normal);
                 material.specular * (normal.dot(&half).max(0.0) as f32).powf(material.shininess)
             } else {
                 0.0

@@ -6,7 +6,7 @@ use sixfold_align::outline::{Alignment, AlignmentOptions, Outline, log_odds, pro
 use sixfold_geometry::nalgebra::UnitQuaternion;
 use sixfold_geometry::{Camera, Pose, Rect, RgbImage, Vec3};
 use sixfold_render::VisibilityBuffer;
-use sixfold_synth::augment::Patch;
+use sixfold_synth::augment::Coverage;
 
 use crate::crop::Crop;
 use crate::direct::Direct;
@@ -209,12 +209,10 @@ impl Views<'_> {
         let objects = [sixfold_render::SceneObject { mesh: self.outline, camera_from_object: *pose }];
         frame.render(&objects, &sixfold_render::RenderOptions::default());
         let side = crop.camera.width;
-        let mut soft = Patch::filled(side, side, [0.0; 3]);
-        for (v, z) in soft.data[..side * side].iter_mut().zip(frame.inverse_depth()) {
-            *v = f32::from(*z > 0.0);
-        }
+        let inverse_depth = frame.inverse_depth();
+        let mut soft = Coverage::from_fn(side, side, |x, y| f32::from(inverse_depth[y * side + x] > 0.0));
         soft.blur(UNDECIDED);
-        soft.data[..side * side].iter().map(|v| v.clamp(1.0 - DECIDED, DECIDED)).collect()
+        soft.data.iter().map(|v| v.clamp(1.0 - DECIDED, DECIDED)).collect()
     }
 }
 

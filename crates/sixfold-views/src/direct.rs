@@ -34,6 +34,8 @@ const MIN_BEFORE: f32 = 0.25;
 const CONVERGED: f64 = 0.01;
 /// Smallest mean of the squared normalised values of a window, over all channels.
 const MIN_ENERGY: f32 = 0.3;
+/// Numbers that are added up side by side.
+const LANES: usize = 16;
 /// Fewest windows.
 const MIN_WINDOWS: usize = 4;
 
@@ -42,10 +44,14 @@ struct Window {
     /// Its centre, and the object's point there.
     centre: Vec2,
     point: Vec3,
-    /// Its pixels that show the object, from the centre.
-    offsets: Vec<[i16; 2]>,
-    /// For each channel and pixel: the normalised value and its derivatives by x and y.
-    values: Vec<[f32; 3]>,
+    /// Half its side, pixels.
+    half: usize,
+    /// 1 for its pixels that show the object and their neighbours do, row by row, with zeros up to a multiple of [`LANES`].
+    mask: Vec<f32>,
+    /// The sum of the mask.
+    shown: f32,
+    /// For each channel the normalised values, their derivatives by x, and those by y; 0 where the mask is.
+    values: Vec<f32>,
     /// Sum of the squared values.
     energy: f32,
 }
@@ -107,9 +113,10 @@ impl<'a> Direct<'a> {
 
     /// Mean correlation of windows at a pose with the crop.
     fn agreement(&self, windows: &[Window], crop: &Patch, pose: &Pose) -> f32 {
+        let mut seen = Vec::new();
         let correlation = |window: &Window| {
             let pixel = self.camera.project(&pose.transform_point(&window.point))?;
-            Some(window.compared(crop, &(pixel - window.centre))?.correlation)
+            Some(window.compared(crop, &(pixel - window.centre), &mut seen)?.correlation)
         };
         windows.iter().filter_map(correlation).sum::<f32>() / windows.len().max(1) as f32
     }
@@ -131,8 +138,13 @@ impl<'a> Direct<'a> {
         for plane in image.planes_mut() {
             plane.iter_mut().zip(&mask.data).for_each(|(v, m)| *v /= m.max(1e-3));
         }
-        // Pixels whose neighbours the blur does not mix with the background.
-        let inside: Vec<bool> = mask.data.iter().map(|m| *m > 0.9).collect();
+        // Pixels whose neighbours are on the object and not mixed with the background by the blur.
+        let drawn = Coverage::from_fn(side, side, |x, y| {
+            let i = y * side + x;
+            let border = x == 0 || y == 0 || x + 1 == side || y + 1 == side;
+            let inside = !border && mask.data[i] > 0.9;
+            f32::from(inside && shown[i - 1] && shown[i + 1] && shown[i - side] && shown[i + side])
+        });
         let mut windows = Vec::new();
         for cy in (half + 1..side.saturating_sub(half + 1)).step_by(step) {
             for cx in (half + 1..side.saturating_sub(half + 1)).step_by(step) {
@@ -140,10 +152,7 @@ impl<'a> Direct<'a> {
                 if point[0].is_nan() {
                     continue;
                 }
-                let drawn = |i: usize| {
-                    inside[i] && shown[i - 1] && shown[i + 1] && shown[i - side] && shown[i + side]
-                };
-                windows.extend(Window::new([cx, cy], point, half, &image, drawn));
+                windows.extend(Window::new([cx, cy], point, half, &image, &drawn));
             }
         }
         windows
@@ -153,12 +162,12 @@ impl<'a> Direct<'a> {
     fn step(&self, windows: &[Window], crop: &Patch, start: &Pose, pose: &Pose) -> Option<(Pose, f64)> {
         let centre = pose.transform_point(&self.centre);
         let mut equations = NormalEquations::default();
-        let mut used = Vec::new();
+        let (mut used, mut seen) = (Vec::new(), Vec::new());
         for window in windows {
             let point = pose.transform_point(&window.point);
             let Some(pixel) = self.camera.project(&point) else { continue };
             let shift = pixel - window.centre;
-            let Some(compared) = window.compared(crop, &shift) else { continue };
+            let Some(compared) = window.compared(crop, &shift, &mut seen) else { continue };
             let correlation = compared.correlation;
             let related = ((correlation - UNRELATED) / (1.0 - UNRELATED)).max(0.0).powi(2);
             let weight = related / (2.0 * (1.0 - correlation) + LEAST_NOISE);
@@ -223,100 +232,149 @@ impl<'a> Direct<'a> {
     }
 }
 
-/// Mean and the factor to unit variance.
-fn normalisation(values: impl Iterator<Item = f32> + Clone) -> (f32, f32) {
-    let count = values.clone().count().max(1) as f32;
-    let mean = values.clone().sum::<f32>() / count;
-    let variance = values.map(|v| (v - mean).powi(2)).sum::<f32>() / count;
-    (mean, 1.0 / variance.sqrt().max(MIN_CONTRAST))
+sixfold_nn::vectorised! {
+    /// Mean of the values where the mask is 1, and the factor to unit variance.
+    fn normalisation(values: &[f32], mask: &[f32], shown: f32) -> [f32; 2] {
+        let (values, _) = values.as_chunks::<LANES>();
+        let (masks, _) = mask.as_chunks::<LANES>();
+        let mut sums = [0.0f32; LANES];
+        for (values, masks) in values.iter().zip(masks) {
+            for l in 0..LANES {
+                sums[l] += masks[l] * values[l];
+            }
+        }
+        let mean = sums.iter().sum::<f32>() / shown;
+        let mut squares = [0.0f32; LANES];
+        for (values, masks) in values.iter().zip(masks) {
+            for l in 0..LANES {
+                squares[l] += masks[l] * (values[l] - mean) * (values[l] - mean);
+            }
+        }
+        let variance = squares.iter().sum::<f32>() / shown;
+        [mean, 1.0 / variance.sqrt().max(MIN_CONTRAST)]
+    }
+}
+
+sixfold_nn::vectorised! {
+    /// Interpolates a window of `wide` x `wide` pixels of a plane, the first pixel of which has number `start`.
+    fn interpolate(out: &mut [f32], plane: &[f32], side: usize, start: usize, wide: usize, weights: [f32; 4]) {
+        for (row, out) in out.chunks_exact_mut(wide).take(wide).enumerate() {
+            let above = &plane[start + row * side..][..wide + 1];
+            let below = &plane[start + (row + 1) * side..][..wide + 1];
+            for x in 0..wide {
+                out[x] = weights[0] * above[x] + weights[1] * above[x + 1] + weights[2] * below[x] + weights[3] * below[x + 1];
+            }
+        }
+    }
+}
+
+sixfold_nn::vectorised! {
+    /// Sums over one channel of a window: products of the derivatives (xx, xy, yy), of derivatives and differences (x, y), of the values seen
+    /// and drawn, and of those seen with themselves.
+    fn products(seen: &[f32], mask: &[f32], values: &[f32], mean: f32, scale: f32) -> [f32; 7] {
+        let count = mask.len();
+        let (drawn, derivatives) = values.split_at(count);
+        let (dx, dy) = derivatives.split_at(count);
+        let (seen, _) = seen.as_chunks::<LANES>();
+        let (masks, _) = mask.as_chunks::<LANES>();
+        let (drawn, _) = drawn.as_chunks::<LANES>();
+        let (dx, _) = dx.as_chunks::<LANES>();
+        let (dy, _) = dy.as_chunks::<LANES>();
+        let mut sums = [[0.0f32; LANES]; 7];
+        for ((((seen, mask), drawn), dx), dy) in seen.iter().zip(masks).zip(drawn).zip(dx).zip(dy) {
+            for l in 0..LANES {
+                let v = mask[l] * (seen[l] - mean) * scale;
+                let difference = v - drawn[l];
+                sums[0][l] += dx[l] * dx[l];
+                sums[1][l] += dx[l] * dy[l];
+                sums[2][l] += dy[l] * dy[l];
+                sums[3][l] += dx[l] * difference;
+                sums[4][l] += dy[l] * difference;
+                sums[5][l] += v * drawn[l];
+                sums[6][l] += v * v;
+            }
+        }
+        sums.map(|lanes| lanes.iter().sum())
+    }
 }
 
 impl Window {
-    /// The window of a render around a pixel that shows `point`, with half a side of `half` pixels; `drawn` tells which pixels have
-    /// neighbours on the object. `None` if it is hardly on the object or has one colour.
+    /// The window of a render around a pixel that shows `point`, with half a side of `half` pixels; `drawn` is 1 for pixels
+    /// that have neighbours on the object. `None` if it is hardly on the object or has one colour.
     fn new(
         [cx, cy]: [usize; 2],
         point: [f32; 3],
         half: usize,
         image: &Patch,
-        drawn: impl Fn(usize) -> bool,
+        drawn: &Coverage,
     ) -> Option<Window> {
-        let (side, reach) = (image.width, half as i16);
-        let at = |o: &[i16; 2]| {
-            (cy as i64 + i64::from(o[1])) as usize * side + (cx as i64 + i64::from(o[0])) as usize
-        };
-        let all = (-reach..=reach).flat_map(|dy| (-reach..=reach).map(move |dx| [dx, dy]));
-        let offsets: Vec<[i16; 2]> = all.filter(|o| drawn(at(o))).collect();
-        if (offsets.len() as f32) < MIN_SHOWN * (2 * half + 1).pow(2) as f32 {
+        let (side, wide) = (image.width, 2 * half + 1);
+        let area = wide * wide;
+        let padded = area.next_multiple_of(LANES);
+        let first = (cy - half) * side + cx - half;
+        let mut mask = vec![0.0f32; padded];
+        for (row, mask) in mask.chunks_exact_mut(wide).take(wide).enumerate() {
+            mask.copy_from_slice(&drawn.data[first + row * side..][..wide]);
+        }
+        let shown: f32 = mask.iter().sum();
+        if shown < MIN_SHOWN * area as f32 {
             return None;
         }
-        let mut values = Vec::with_capacity(3 * offsets.len());
+        let mut values = vec![0.0; 9 * padded];
         let mut energy = 0.0;
-        for plane in image.data.chunks_exact(side * side) {
-            let (mean, scale) = normalisation(offsets.iter().map(|o| plane[at(o)]));
-            for i in offsets.iter().map(at) {
-                let value = (plane[i] - mean) * scale;
-                energy += value * value;
-                values.push([
-                    value,
-                    0.5 * scale * (plane[i + 1] - plane[i - 1]),
-                    0.5 * scale * (plane[i + side] - plane[i - side]),
-                ]);
+        let mut own = vec![0.0; padded];
+        for (plane, values) in image.data.chunks_exact(side * side).zip(values.chunks_exact_mut(3 * padded)) {
+            for (row, own) in own.chunks_exact_mut(wide).take(wide).enumerate() {
+                own.copy_from_slice(&plane[first + row * side..][..wide]);
+            }
+            let [mean, scale] = normalisation(&own, &mask, shown);
+            let (drawn, derivatives) = values.split_at_mut(padded);
+            let (dx, dy) = derivatives.split_at_mut(padded);
+            for row in 0..wide {
+                let (i, k) = (first + row * side, row * wide);
+                let around =
+                    [-1, 1, -(side as i64), side as i64].map(|o| &plane[(i as i64 + o) as usize..][..wide]);
+                let pixels = own[k..].iter().zip(&mask[k..]).take(wide);
+                for (x, (v, m)) in pixels.enumerate() {
+                    let value = m * (v - mean) * scale;
+                    energy += value * value;
+                    drawn[k + x] = value;
+                    dx[k + x] = m * 0.5 * scale * (around[1][x] - around[0][x]);
+                    dy[k + x] = m * 0.5 * scale * (around[3][x] - around[2][x]);
+                }
             }
         }
         let centre = Vec2::new(cx as f64, cy as f64);
         let point = Vec3::from(point.map(f64::from));
-        (energy > MIN_ENERGY * offsets.len() as f32).then_some(Window {
-            centre,
-            point,
-            offsets,
-            values,
-            energy,
-        })
+        (energy > MIN_ENERGY * shown).then_some(Window { centre, point, half, mask, shown, values, energy })
     }
 
-    /// The window and the crop at a shift; `None` if the crop does not contain it.
-    fn compared(&self, crop: &Patch, shift: &Vec2) -> Option<Compared> {
+    /// The window and the crop at a shift; `None` if the crop does not contain it. `seen` is a buffer.
+    fn compared(&self, crop: &Patch, shift: &Vec2, seen: &mut Vec<f32>) -> Option<Compared> {
         let side = crop.width;
         let at = self.centre + shift;
         let (x0, y0) = (at.x.floor(), at.y.floor());
         let (fx, fy) = ((at.x - x0) as f32, (at.y - y0) as f32);
-        let (x0, y0) = (x0 as i64, y0 as i64);
         let weights = [(1.0 - fx) * (1.0 - fy), fx * (1.0 - fy), (1.0 - fx) * fy, fx * fy];
-        let inside = |o: &[i16; 2]| {
-            let (x, y) = (x0 + i64::from(o[0]), y0 + i64::from(o[1]));
-            x >= 0 && y >= 0 && x + 1 < side as i64 && y + 1 < side as i64
-        };
-        if !self.offsets.iter().all(inside) {
+        let (half, wide) = (self.half as f64, 2 * self.half + 1);
+        let last = side as f64 - 1.0 - half;
+        if !(x0 >= half && y0 >= half && x0 < last && y0 < last) {
             return None;
         }
-        let count = self.offsets.len();
-        let mut seen = vec![0.0f32; count];
-        let (mut gradients, mut sums) = ([0.0; 3], [0.0; 2]);
-        let (mut product, mut energy) = (0.0, 0.0);
-        for (plane, values) in crop.data.chunks_exact(side * side).zip(self.values.chunks_exact(count)) {
-            for (v, o) in seen.iter_mut().zip(&self.offsets) {
-                let i = (y0 + i64::from(o[1])) as usize * side + (x0 + i64::from(o[0])) as usize;
-                *v = weights[0] * plane[i]
-                    + weights[1] * plane[i + 1]
-                    + weights[2] * plane[i + side]
-                    + weights[3] * plane[i + side + 1];
-            }
-            let (mean, scale) = normalisation(seen.iter().copied());
-            for (v, [value, dx, dy]) in seen.iter().zip(values) {
-                let v = (v - mean) * scale;
-                product += v * value;
-                energy += v * v;
-                let difference = v - value;
-                gradients[0] += dx * dx;
-                gradients[1] += dx * dy;
-                gradients[2] += dy * dy;
-                sums[0] += dx * difference;
-                sums[1] += dy * difference;
-            }
+        let start = (y0 as usize - self.half) * side + x0 as usize - self.half;
+        let count = self.mask.len();
+        seen.clear();
+        seen.resize(count, 0.0);
+        let mut sums = [0.0f32; 7];
+        for (plane, values) in crop.data.chunks_exact(side * side).zip(self.values.chunks_exact(3 * count)) {
+            interpolate(seen, plane, side, start, wide, weights);
+            let [mean, scale] = normalisation(seen, &self.mask, self.shown);
+            let more = products(seen, &self.mask, values, mean, scale);
+            sums.iter_mut().zip(more).for_each(|(sum, more)| *sum += more);
         }
+        let [xx, xy, yy, x, y, product, energy] = sums;
         let correlation = product / (energy * self.energy).sqrt().max(1e-6);
-        Some(Compared { gradients, sums, correlation })
+        Some(Compared { gradients: [xx, xy, yy], sums: [x, y], correlation })
     }
 }
 

@@ -238,21 +238,27 @@ impl Views<'_> {
         ranked: &[(usize, f32)],
         hypotheses: usize,
     ) -> Result<Vec<Hypothesis>, ViewsError> {
-        let mut first: Vec<Hypothesis> =
-            ranked.par_iter().filter_map(|(i, _)| self.pose_by(&self.templates[*i], part)).collect();
-        first.sort_by(|a, b| b.inliers.cmp(&a.inliers).then(b.similarity.total_cmp(&a.similarity)));
-        let mut kept: Vec<Hypothesis> = Vec::new();
-        for hypothesis in first {
-            if kept.len() < hypotheses && kept.iter().all(|k| !self.same(k, &hypothesis)) {
-                kept.push(hypothesis);
-            }
-        }
-        let mut hypotheses: Vec<Hypothesis> = self.moved(kept, part)?.into_iter().map(|(h, _)| h).collect();
+        let starts = self.starts(part, ranked, hypotheses);
+        let mut hypotheses: Vec<Hypothesis> = self.moved(starts, part)?.into_iter().map(|(h, _)| h).collect();
         for hypothesis in &mut hypotheses {
             hypothesis.camera_from_object = part.crop.to_camera(&hypothesis.camera_from_object);
         }
         hypotheses.sort_by(|a, b| b.similarity.total_cmp(&a.similarity));
         Ok(hypotheses)
+    }
+
+    /// Poses, in the crop's camera, by the correspondences with each of the templates, no two about the same, those with most inliers first.
+    pub(crate) fn starts(&self, part: &Part, ranked: &[(usize, f32)], most: usize) -> Vec<Hypothesis> {
+        let mut first: Vec<Hypothesis> =
+            ranked.par_iter().filter_map(|(i, _)| self.pose_by(&self.templates[*i], part)).collect();
+        first.sort_by(|a, b| b.inliers.cmp(&a.inliers).then(b.similarity.total_cmp(&a.similarity)));
+        let mut kept: Vec<Hypothesis> = Vec::new();
+        for hypothesis in first {
+            if kept.len() < most && kept.iter().all(|k| !self.same(k, &hypothesis)) {
+                kept.push(hypothesis);
+            }
+        }
+        kept
     }
 
     /// Whether two poses are so close that refining both is useless.
@@ -303,7 +309,7 @@ impl Views<'_> {
             return Ok(self.refined(hypotheses, part)?.into_iter().map(|h| (h, None)).collect());
         };
         let poses: Vec<Pose> = hypotheses.iter().map(|h| h.camera_from_object).collect();
-        let nearest = MIN_DISTANCE * self.templates_diameter();
+        let nearest = self.nearest();
         let times = self.options.refinements;
         let refined = refiner.refine(self.extractor, self.mesh, &part.target(), &poses, nearest, times)?;
         let moved = hypotheses.into_iter().zip(refined).map(|(hypothesis, refined)| {
@@ -356,7 +362,7 @@ impl Views<'_> {
                 || VisibilityBuffer::new(&crop.camera),
                 |frame, h| {
                     let t = h.camera_from_object.translation();
-                    if t.z < MIN_DISTANCE * self.templates_diameter() {
+                    if t.z < self.nearest() {
                         return None;
                     }
                     let rendered = render(frame, self.mesh, &h.camera_from_object, None);
@@ -380,9 +386,10 @@ impl Views<'_> {
         Ok(out)
     }
 
-    fn templates_diameter(&self) -> f64 {
+    /// The distance from which on objects are rendered, metres.
+    pub(crate) fn nearest(&self) -> f64 {
         let (low, high) = self.mesh.bounding_box();
-        (high - low).norm()
+        MIN_DISTANCE * (high - low).norm()
     }
 
     /// Correspondences at a pose, and the similarity of the rendered object and the crop.
@@ -395,7 +402,7 @@ impl Views<'_> {
             let compared = self.compared(&[*hypothesis], part)?.into_iter().next().flatten();
             return Ok(compared.map(|c| (c.points.into_iter().zip(c.pixels).collect(), c.similarity)));
         };
-        let nearest = MIN_DISTANCE * self.templates_diameter();
+        let nearest = self.nearest();
         let poses = [hypothesis.camera_from_object];
         let seen = refiner.compare(self.extractor, self.mesh, &part.target(), &poses, nearest)?;
         Ok(seen.into_iter().next().flatten().map(|seen| {
@@ -434,7 +441,7 @@ impl Part {
         Some(chromas(&self.patch.data, self.patch.width, |_| true)).filter(|chromas| !grey(chromas))
     }
 
-    fn target(&self) -> Target<'_> {
+    pub(crate) fn target(&self) -> Target<'_> {
         Target { camera: &self.crop.camera, input: &self.input, map: &self.map }
     }
 }

@@ -1,5 +1,7 @@
 //! Features of crops: one unit vector for every 8x8 pixels.
 
+use std::borrow::Borrow;
+
 use burn::tensor::{Device, Tensor, TensorData};
 use sixfold_nn::xfeat::{CELL, CHANNELS};
 
@@ -61,7 +63,11 @@ impl Extractor {
     ///
     /// # Errors
     /// [`ViewsError::Network`] if the network's output cannot be read.
-    pub fn features(&self, inputs: &[Vec<f32>], side: usize) -> Result<Vec<FeatureMap>, ViewsError> {
+    pub fn features<I: Borrow<[f32]>>(
+        &self,
+        inputs: &[I],
+        side: usize,
+    ) -> Result<Vec<FeatureMap>, ViewsError> {
         let cells = side / CELL;
         let count = cells * cells;
         let mut maps = Vec::with_capacity(inputs.len());

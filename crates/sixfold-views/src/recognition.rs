@@ -70,8 +70,8 @@ impl Recogniser {
         let mut out = Vec::with_capacity(crops.len());
         for batch in crops.chunks(BATCH) {
             // The network was trained on `(value - 127) / 128` of 8-bit values.
-            let data: Vec<f32> =
-                batch.iter().flat_map(|c| c.iter().map(|v| (v * 255.0 - 127.0) / 128.0)).collect();
+            let mut data: Vec<f32> = Vec::with_capacity(batch.len() * 3 * side * side);
+            batch.iter().for_each(|c| data.extend(c.iter().map(|v| (v * 255.0 - 127.0) / 128.0)));
             let data = TensorData::new(data, [batch.len(), 3, side, side]);
             let mut maps = self.network.forward_stages(Tensor::<4>::from_data(data, &self.device), STAGES);
             let Some(last) = maps.pop() else { break };

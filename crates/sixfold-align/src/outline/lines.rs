@@ -5,7 +5,7 @@
 use sixfold_geometry::{Camera, NormalEquations, Pose, Rect, Vec2, Vec3};
 use sixfold_mesh::{Mesh, simplify};
 use sixfold_render::{RenderOptions, SceneObject, VisibilityBuffer};
-use sixfold_synth::augment::Patch;
+use sixfold_synth::augment::{Coverage, Patch};
 
 /// Fewest lines that determine a pose: twice its six degrees of freedom.
 pub const MIN_LINES: usize = 12;
@@ -125,12 +125,9 @@ impl<'a> Outline<'a> {
         self.frame.render(&objects, &RenderOptions::default());
         let side = self.side;
         let inverse_depth = self.frame.inverse_depth();
-        let mut soft = Patch::filled(side, side, [0.0; 3]);
-        for (value, z) in soft.data[..side * side].iter_mut().zip(inverse_depth) {
-            *value = f32::from(*z > 0.0);
-        }
+        let mut soft = Coverage::from_fn(side, side, |x, y| f32::from(inverse_depth[y * side + x] > 0.0));
         soft.blur(SILHOUETTE_BLUR);
-        let soft = &soft.data[..side * side];
+        let soft = &soft.data;
         let mut lines = Vec::new();
         let margin = CROP_MARGIN;
         for y in margin..side - margin {

@@ -157,6 +157,20 @@ pub struct Refined {
     pub seen: Option<Displaced>,
 }
 
+/// A pose between two iterations.
+pub(crate) struct Progress {
+    /// The best of the iterations so far.
+    pub(crate) best: Refined,
+    /// The pose of the next one; `None` if the last one hardly moved it, or it is stopped.
+    pub(crate) next: Option<Pose>,
+}
+
+impl Progress {
+    pub(crate) fn new(pose: Pose) -> Progress {
+        Progress { best: Refined { pose, score: 0.0, seen: None }, next: Some(pose) }
+    }
+}
+
 impl Displaced {
     /// The points that the crop shows with a probability above a half, and their pixels.
     pub(crate) fn sure(self) -> Vec<(Vec3, Vec2)> {
@@ -208,7 +222,7 @@ impl Refiner {
                 |frame, pose| (pose.translation().z >= nearest).then(|| shown(frame, mesh, pose)).flatten(),
             )
             .collect();
-        let inputs: Vec<Vec<f32>> = rendered.iter().flatten().map(|s| s.input.clone()).collect();
+        let inputs: Vec<&[f32]> = rendered.iter().flatten().map(|s| &s.input[..]).collect();
         let maps = extractor.features(&inputs, side)?;
         let all: Vec<&Shown> = rendered.iter().flatten().collect();
         let pairs: Vec<Pair> =
@@ -240,31 +254,43 @@ impl Refiner {
         nearest: f64,
         times: usize,
     ) -> Result<Vec<Refined>, ViewsError> {
-        let mut best: Vec<Refined> =
-            poses.iter().map(|pose| Refined { pose: *pose, score: 0.0, seen: None }).collect();
-        // Poses that still move, with their numbers.
-        let mut now: Vec<(usize, Pose)> = poses.iter().copied().enumerate().collect();
-        for pass in 0..=times {
-            let poses: Vec<Pose> = now.iter().map(|(_, pose)| *pose).collect();
-            let compared = self.compare(extractor, mesh, crop, &poses, nearest)?;
-            let mut moving = Vec::with_capacity(now.len());
-            for ((number, pose), compared) in now.into_iter().zip(compared) {
-                let Some(compared) = compared else { continue };
-                let moved = compared.pose(crop.camera, &pose);
-                moving.extend(moved.filter(|m| compared.moves(crop.camera, &pose, m)).map(|m| (number, m)));
-                if pass == 0 || compared.score >= best[number].score {
-                    best[number] = Refined { pose, score: compared.score, seen: Some(compared) };
-                }
-            }
-            now = moving;
+        let mut all: Vec<Progress> = poses.iter().map(|pose| Progress::new(*pose)).collect();
+        for _ in 0..=times {
+            self.advance(extractor, mesh, crop, &mut all.iter_mut().collect::<Vec<_>>(), nearest)?;
         }
-        Ok(best)
+        Ok(all.into_iter().map(|progress| progress.best).collect())
+    }
+
+    /// One of the iterations of [`Refiner::refine`], for the poses that still move.
+    ///
+    /// # Errors
+    /// [`ViewsError::Network`].
+    pub(crate) fn advance(
+        &self,
+        extractor: &Extractor,
+        mesh: &Mesh,
+        crop: &Target<'_>,
+        all: &mut [&mut Progress],
+        nearest: f64,
+    ) -> Result<(), ViewsError> {
+        let poses: Vec<Pose> = all.iter().filter_map(|progress| progress.next).collect();
+        let mut compared = self.compare(extractor, mesh, crop, &poses, nearest)?.into_iter();
+        for progress in all {
+            let Some(pose) = progress.next.take() else { continue };
+            let Some(compared) = compared.next().flatten() else { continue };
+            let moved = compared.pose(crop.camera, &pose);
+            progress.next = moved.filter(|moved| compared.moves(crop.camera, &pose, moved));
+            if progress.best.seen.is_none() || compared.score >= progress.best.score {
+                progress.best = Refined { pose, score: compared.score, seen: Some(compared) };
+            }
+        }
+        Ok(())
     }
 
     fn run(&self, batch: &[Pair], side: usize) -> Result<Vec<f32>, ViewsError> {
         let cells = side / CELL;
-        let pictures: Vec<f32> = batch.iter().flat_map(|p| p.picture.iter().copied()).collect();
-        let of_cells: Vec<f32> = batch.iter().flat_map(|p| p.cells.iter().copied()).collect();
+        let pictures = batch.iter().map(|p| &p.picture[..]).collect::<Vec<_>>().concat();
+        let of_cells = batch.iter().map(|p| &p.cells[..]).collect::<Vec<_>>().concat();
         let pictures = TensorData::new(pictures, [batch.len(), PICTURE_INPUTS, side, side]);
         let of_cells = TensorData::new(of_cells, [batch.len(), CELL_INPUTS, cells, cells]);
         let out = self.network.forward(
