@@ -16,6 +16,10 @@ use sixfold_views::{Recogniser, ViewsRefiner};
 
 use crate::estimator::AutoEstimator;
 
+/// Places of a colour image in which views are searched: the number with which the probabilities were fitted. With more, more objects that are
+/// absent could be reported.
+const PLACES: usize = 8;
+
 /// Which methods are included.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct AutoMembers<'a> {
@@ -62,6 +66,7 @@ impl AutoMembers<'_> {
         if !self.without_views {
             let mut views = ViewsEstimator::shipped().map_err(EstimatorError::method)?;
             views.options.seed = self.seed;
+            views.options.places = PLACES;
             let proposals = TrainedDetector::proposals().map_err(EstimatorError::method)?;
             members.push(Arc::new(views.with_proposals(Arc::new(proposals))));
         }
