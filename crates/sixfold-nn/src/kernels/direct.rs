@@ -282,7 +282,6 @@ struct Band<'a> {
     /// Beginning of the first output's rows, and numbers per output.
     begin: usize,
     pixels: usize,
-    rows: usize,
     columns: usize,
     /// Columns of a plane.
     wide: usize,
@@ -296,7 +295,7 @@ impl Band<'_> {
         while at < end {
             let (row, column) = (at / self.wide, at % self.wide);
             let next = ((row + 1) * self.wide).min(end);
-            if row < self.rows && column < self.columns {
+            if column < self.columns {
                 let count = (next - at).min(self.columns - column);
                 let start = self.begin + output * self.pixels + row * self.columns + column;
                 // SAFETY: every task writes its own rows.
@@ -380,7 +379,7 @@ fn with_vectors(
             &own
         };
         let begin = b * shape.outputs * height * width + first * width;
-        let band = Band { shared, begin, pixels: height * width, rows, columns: width, wide: padded.columns };
+        let band = Band { shared, begin, pixels: height * width, columns: width, wide: padded.columns };
         PADDED.with_borrow_mut(|buffer| {
             let length = shape.inputs * spec.stride * spec.stride * plane;
             // The last tile reads past the end.
