@@ -19,20 +19,20 @@ pub fn to_byte(linear: f32) -> u8 {
     TABLE.byte(linear)
 }
 
-/// Ranges of linear light, equally long; none has more than two bytes.
+/// Number of equal ranges of linear light; none contains more than two bytes.
 const RANGES: usize = 4096;
 
 struct Table {
-    /// The least light of each byte; nothing reaches the last.
-    least: [f32; 257],
-    /// The byte of the least light of each range.
+    /// The smallest linear value that gives each byte; no value reaches the last entry.
+    smallest: [f32; 257],
+    /// The byte at the beginning of each range.
     first: [u8; RANGES + 1],
 }
 
 impl Table {
     fn new() -> Table {
-        let mut least = [f32::INFINITY; 257];
-        for (byte, least) in least.iter_mut().take(256).enumerate() {
+        let mut smallest = [f32::INFINITY; 257];
+        for (byte, smallest) in smallest.iter_mut().take(256).enumerate() {
             // The numbers from 0 to 1 are in the order of their bits.
             let (mut low, mut high) = (0, 1f32.to_bits());
             while low < high {
@@ -43,17 +43,17 @@ impl Table {
                     high = middle;
                 }
             }
-            *least = f32::from_bits(low);
+            *smallest = f32::from_bits(low);
         }
         let first = std::array::from_fn(|range| computed_byte(range as f32 / RANGES as f32));
-        Table { least, first }
+        Table { smallest, first }
     }
 
     fn byte(&self, linear: f32) -> u8 {
         let linear = linear.clamp(0.0, 1.0);
         // NaN is 0 here, as it is for a computed byte.
         let first = self.first[(linear * RANGES as f32) as usize];
-        first + u8::from(linear >= self.least[usize::from(first) + 1])
+        first + u8::from(linear >= self.smallest[usize::from(first) + 1])
     }
 }
 
@@ -82,8 +82,8 @@ mod tests {
     fn bytes_of_the_table_are_those_of_the_formula() {
         let table = Table::new();
         // Every light whose byte could be wrong by rounding, and an even spread.
-        let close = table.least[1..256].iter().flat_map(|least| {
-            let bits = least.to_bits();
+        let close = table.smallest[1..256].iter().flat_map(|smallest| {
+            let bits = smallest.to_bits();
             (bits - 3..bits + 3).map(f32::from_bits)
         });
         let even = (0..=100_000).map(|i| i as f32 / 100_000.0);

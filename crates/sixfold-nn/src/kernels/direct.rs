@@ -26,7 +26,6 @@ thread_local! {
 
 /// The vectors of a processor.
 #[derive(Clone, Copy)]
-#[cfg_attr(not(target_arch = "x86_64"), allow(dead_code))]
 enum Vectors {
     Avx512,
     Avx2,
@@ -34,18 +33,12 @@ enum Vectors {
 
 impl Vectors {
     /// Those of this processor; `None` if it has none with fused multiplication and addition.
-    #[cfg(target_arch = "x86_64")]
     fn of_processor() -> Option<Vectors> {
         use std::arch::is_x86_feature_detected as has;
         if has!("avx512f") {
             return Some(Vectors::Avx512);
         }
         (has!("avx2") && has!("fma")).then_some(Vectors::Avx2)
-    }
-
-    #[cfg(not(target_arch = "x86_64"))]
-    fn of_processor() -> Option<Vectors> {
-        None
     }
 }
 
@@ -162,7 +155,6 @@ fn packed(weight: &[f32], outputs: usize) -> Vec<f32> {
 /// A tile of the output: `B` blocks of outputs, and pixels.
 type Tile<const B: usize> = [[[f32; TILE]; TOGETHER]; B];
 
-#[cfg(target_arch = "x86_64")]
 macro_rules! kernel {
     ($name:ident, $features:literal, $width:literal, $zero:ident, $load:ident, $set:ident, $fma:ident, $store:ident) => {
         /// Adds to each output of a tile, of `V` vectors of pixels, the products of its weights and the source at each tap.
@@ -214,7 +206,6 @@ macro_rules! kernel {
     };
 }
 
-#[cfg(target_arch = "x86_64")]
 kernel!(
     avx512,
     "avx512f",
@@ -225,7 +216,6 @@ kernel!(
     _mm512_fmadd_ps,
     _mm512_storeu_ps
 );
-#[cfg(target_arch = "x86_64")]
 kernel!(
     avx2,
     "avx2,fma",
@@ -238,7 +228,6 @@ kernel!(
 );
 
 /// The sums of products for up to `pixels` pixels of `B` blocks of outputs; returns how many pixels it computed.
-#[cfg(target_arch = "x86_64")]
 fn products<const B: usize>(
     vectors: Vectors,
     weights: [&[f32]; B],
@@ -263,18 +252,6 @@ fn products<const B: usize>(
         }
     }
     pixels.min(TILE)
-}
-
-#[cfg(not(target_arch = "x86_64"))]
-fn products<const B: usize>(
-    _: Vectors,
-    _: [&[f32]; B],
-    _: &[usize],
-    _: &[f32],
-    pixels: usize,
-    _: &mut Tile<B>,
-) -> usize {
-    pixels
 }
 
 /// Where the results of a band go.

@@ -6,6 +6,7 @@
 
 mod dense;
 mod depthwise;
+#[cfg(target_arch = "x86_64")]
 mod direct;
 mod gather;
 mod lstm;
@@ -24,7 +25,6 @@ pub(crate) use upsample::{upsample_2x, upsample_2x_backward};
 
 use dense::{dense_backward, dense_forward};
 use depthwise::{depthwise_backward, depthwise_forward};
-use direct::direct_forward;
 
 /// Sizes of one convolution: `x` is `batch x inputs x height x width`, the weights are
 /// `outputs x inputs / groups x kernel x kernel`.
@@ -75,8 +75,11 @@ pub(crate) fn conv_forward(
     spec: &ConvSpec,
 ) -> Vec<f32> {
     if spec.groups == 1 {
-        direct_forward(x, weight, bias, shape, spec)
-            .unwrap_or_else(|| dense_forward(x, weight, bias, shape, spec))
+        #[cfg(target_arch = "x86_64")]
+        if let Some(y) = direct::direct_forward(x, weight, bias, shape, spec) {
+            return y;
+        }
+        dense_forward(x, weight, bias, shape, spec)
     } else {
         depthwise_forward(x, weight, bias, shape, spec)
     }
