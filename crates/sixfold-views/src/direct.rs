@@ -450,4 +450,57 @@ mod tests {
         let flat = Patch::filled(SIDE, SIDE, [0.5; 3]);
         assert_eq!(Direct::new(&plain, &camera(), &flat).run(&near()), None);
     }
+
+    #[test]
+    fn a_window_is_compared_by_sums_over_its_pixels_on_the_object() {
+        let side = 40;
+        let noise = |seed: usize| {
+            let mut patch = Patch::filled(side, side, [0.0; 3]);
+            let values = patch.data.iter_mut().enumerate();
+            values.for_each(|(i, v)| *v = ((i * 7919 + seed) % 997) as f32 / 997.0);
+            patch
+        };
+        let (image, crop) = (noise(1), noise(500));
+        let drawn = Coverage::from_fn(side, side, |x, y| f32::from((x + y) % 5 != 0));
+        let window = Window::new([20, 18], [0.0; 3], 6, &image, &drawn).unwrap();
+        let found = window.compared(&crop, &Vec2::new(1.25, -0.5), &mut Vec::new()).unwrap();
+        let all = (12..=24).flat_map(|y| (14..=26).map(move |x| (x, y)));
+        let pixels: Vec<(usize, usize)> = all.filter(|(x, y)| (x + y) % 5 != 0).collect();
+        // Values less their mean, and the factor to unit variance.
+        let normalised = |at: &dyn Fn(usize, usize) -> f64| {
+            let values: Vec<f64> = pixels.iter().map(|(x, y)| at(*x, *y)).collect();
+            let mean = values.iter().sum::<f64>() / values.len() as f64;
+            let variance = values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / values.len() as f64;
+            let scale = 1.0 / variance.sqrt();
+            (values.into_iter().map(|v| (v - mean) * scale).collect::<Vec<f64>>(), scale)
+        };
+        let mut sums = [0.0; 7];
+        for channel in 0..3 {
+            let of = |patch: &Patch, x: usize, y: usize| {
+                f64::from(patch.data[channel * side * side + y * side + x])
+            };
+            let (template, scale) = normalised(&|x, y| of(&image, x, y));
+            // The shift is a pixel and a quarter to the right, half a pixel up.
+            let seen = |x: usize, y: usize| {
+                let row = |y: usize| 0.75 * of(&crop, x + 1, y) + 0.25 * of(&crop, x + 2, y);
+                0.5 * (row(y - 1) + row(y))
+            };
+            for (((x, y), t), v) in pixels.iter().zip(template).zip(normalised(&seen).0) {
+                let dx = 0.5 * scale * (of(&image, x + 1, *y) - of(&image, x - 1, *y));
+                let dy = 0.5 * scale * (of(&image, *x, y + 1) - of(&image, *x, y - 1));
+                let terms = [dx * dx, dx * dy, dy * dy, dx * (v - t), dy * (v - t), v * t, t * t];
+                sums.iter_mut().zip(terms).for_each(|(sum, term)| *sum += term);
+            }
+        }
+        let [xx, xy, yy, x, y, product, energy] = sums;
+        let right = [xx, xy, yy, x, y, product / energy];
+        let [a, b, c] = found.gradients;
+        let [d, e] = found.sums;
+        for (found, right) in [a, b, c, d, e, found.correlation].into_iter().zip(right) {
+            assert!((f64::from(found) - right).abs() < 1e-3 * right.abs().max(1.0), "{found} {right}");
+        }
+        assert!(xy.abs() > 1.0, "the noise has no mixed gradient: {xy}");
+        // A window that is not inside the crop.
+        assert!(window.compared(&crop, &Vec2::new(15.0, 0.0), &mut Vec::new()).is_none());
+    }
 }
