@@ -82,7 +82,10 @@ pub struct ViewsOptions {
 /// .534 / .368 (on these 161 targets the right place is among the first 8 for 70 % instead of 65 %), with a mean over the other objects searched for
 /// subtracted as well 70 %, too (first place: 50 % instead of 45 %). With the present proposals, on 85 targets: 8 places .395 / .507 / .365, 20
 /// places with poses stopped early .413 / .532 / .365 in the same time, at most two poses of a place .404 / .522 / .353, of 24 such poses the 12 that are
-/// recognised best .404 / .520 / .353. Colours do not help to choose templates in a given region (.452 / .652 / .388 with a
+/// recognised best .404 / .520 / .353; recognition relative to that of the image's places, of 24 and of 12 poses, .420 / .554 / .365 (76 targets of other
+/// frames: .426 / .545 / .329 instead of .420 / .533 / .329), with the render's colours as well, of 36 and of 12 poses, .420 / .549 / .365; with 40 places and
+/// three poses each .376 / .502 / .306; with 12 of the boxes enlarged by 1.35 as well, with three poses each, .422 / .549 / .353 (with
+/// 72 and 24 poses going on, the latter by what is recognised, .421 / .559 / .353 in 1.25 times the time). Colours do not help to choose templates in a given region (.452 / .652 / .388 with a
 /// weight of 0.2 instead of .481 / .673 / .424). The others were chosen by hand.
 ///
 /// `too_far`: median over the poses with the right rotation: 1.2 % of the distance on 443 of LM-O's development frames (with the

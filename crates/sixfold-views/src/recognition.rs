@@ -100,17 +100,28 @@ impl Recogniser {
         camera: &Camera,
         camera_from_object: &Pose,
     ) -> Result<Option<f64>, ViewsError> {
+        let compared = self.compare(mesh, image, camera, camera_from_object)?;
+        Ok(compared.map(|(view, seen)| f64::from(view.similarity(&seen))))
+    }
+
+    /// The features of the object rendered at a pose, and those of the image there; `None` if the pose shows nothing of the object.
+    pub(crate) fn compare(
+        &self,
+        mesh: &Mesh,
+        image: &RgbImage,
+        camera: &Camera,
+        camera_from_object: &Pose,
+    ) -> Result<Option<(Appearance, Recognised)>, ViewsError> {
         let crop = projected_box(mesh, camera, camera_from_object)
             .and_then(|bbox| Crop::of_box(camera, &bbox, CROP_FACTOR, SIDE));
         let Some(crop) = crop else { return Ok(None) };
         let mut frame = VisibilityBuffer::new(&crop.camera);
         let rendered = render(&mut frame, mesh, &crop.to_crop(camera_from_object), None);
         let seen = crop.cut(image, camera, [0.5; 3]).data;
-        let [view, seen] = &self.features(&[&over_grey(&rendered), &seen], SIDE)?[..] else {
-            return Ok(None);
-        };
-        let appearance = Appearance::new(view, |i| rendered.shows(i));
-        Ok((!appearance.cells.is_empty()).then(|| f64::from(appearance.similarity(seen))))
+        let mut features = self.features(&[&over_grey(&rendered), &seen], SIDE)?;
+        let (Some(seen), Some(view)) = (features.pop(), features.pop()) else { return Ok(None) };
+        let view = Appearance::new(&view, |i| rendered.shows(i));
+        Ok((!view.cells.is_empty()).then_some((view, seen)))
     }
 }
 

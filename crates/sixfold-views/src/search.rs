@@ -1,7 +1,7 @@
 //! Search without a given region: a detector of any object proposes boxes, the object's templates select those similar to it, and
 //! poses are estimated there (the structure of CNOS, Nguyen et al. 2023, whose proposals and features come from foundation models; ours
 //! are small networks). Similarities are standardised for each view, over all boxes: `(s - mean) / deviation` (as in speaker verification, Z-norm,
-//! Auckenthaler et al. 2000). Of the poses, those at which the image is recognised as the object come first (`recognition`).
+//! Auckenthaler et al. 2000). Of the poses, those come first at which the image is more similar to the object (`recognition`) than it is elsewhere.
 //!
 //! Proposals and their features belong to the image: they are computed once, for all objects searched in it.
 
@@ -34,6 +34,12 @@ const AT_ONCE: usize = 16;
 /// Number of poses, over all places, that are refined further after each of the first iterations. With 20 places this takes as long as
 /// refining all poses of 8; AR_MSSD / AR_MSPD / ADD(-S) on 85 targets of LM-O's development frames .413 / .532 / .365 instead of .395 / .507 / .365.
 const KEPT: [usize; 2] = [48, 24];
+
+/// So many times as many poses as are refined in a crop of their own are compared with the image there before.
+const CONSIDERED: usize = 2;
+
+/// Number of places without any similarity that are added to those of an image: if there are only few, they may all be the object's own.
+const UNLIKE: f32 = 8.0;
 
 /// A box that may show an object, with the networks' features there.
 pub(crate) struct Place {
@@ -108,22 +114,29 @@ impl Views<'_> {
         alike.truncate(self.options.places.saturating_add(instances - 1));
         let alike: Vec<&Place> = alike.into_iter().map(|(place, _)| place).collect();
         let mut pool = self.pool(&alike, instances)?;
-        pool.sort_by(|a, b| b.1.similarity.total_cmp(&a.1.similarity));
-        // The best of all and, if several instances are requested, the best of each place.
-        let mut seen = vec![false; alike.len()];
-        let mut chosen = Vec::new();
-        for (number, pose) in pool {
-            let first = !std::mem::replace(&mut seen[number], true);
-            if chosen.len() < self.options.place_close || (first && instances > 1) {
-                chosen.push((pose, alike[number].bbox));
-            }
-        }
+        pool.sort_by(|a, b| b.0.similarity.total_cmp(&a.0.similarity));
+        // The first of all and, if several instances are requested, the first of each place.
+        let first = |poses: Vec<(Hypothesis, usize)>, most: usize| -> Vec<(Hypothesis, usize)> {
+            let mut seen = vec![false; alike.len()];
+            let mut rank = 0;
+            let chosen = |(_, number): &(Hypothesis, usize)| {
+                rank += 1;
+                let of_place = !std::mem::replace(&mut seen[*number], true);
+                rank <= most || (of_place && instances > 1)
+            };
+            poses.into_iter().filter(chosen).collect()
+        };
+        let close = self.options.place_close;
+        let considered = first(pool, close.saturating_mul(CONSIDERED));
+        let considered = self.recognised(considered, places, image, camera)?;
+        let chosen = first(considered, close).into_iter();
+        let mut chosen: Vec<(Hypothesis, Rect)> = chosen.map(|(h, number)| (h, alike[number].bbox)).collect();
         let prints = self.prints(keypoints, camera);
         chosen.extend(self.by_print(prints.as_ref(), camera, instances));
-        let found =
-            self.recognised(self.closer_all(chosen, prints.as_ref(), image, camera)?, image, camera)?;
+        let closer = self.closer_all(chosen, prints.as_ref(), image, camera)?;
+        let found = self.recognised(closer.into_iter().map(|h| (h, ())).collect(), places, image, camera)?;
         let mut kept: Vec<Hypothesis> = Vec::new();
-        for hypothesis in found {
+        for (hypothesis, ()) in found {
             if kept.len() < instances && kept.iter().all(|k| !self.one(camera, k, &hypothesis)) {
                 kept.push(hypothesis);
             }
@@ -131,17 +144,17 @@ impl Views<'_> {
         Ok(kept)
     }
 
-    /// Poses in some places, with the place's number. The refiner renders and compares all of them once; after each of the first iterations
+    /// Poses in some places, each with the place's number. The refiner renders and compares all of them once; after each of the first iterations
     /// only those at which the image agrees best go on, over all places together, and, if there may be several instances, the best of each
     /// place (successive halving, Jamieson and Talwalkar 2016).
-    fn pool(&self, places: &[&Place], instances: usize) -> Result<Vec<(usize, Hypothesis)>, ViewsError> {
+    fn pool(&self, places: &[&Place], instances: usize) -> Result<Vec<(Hypothesis, usize)>, ViewsError> {
         let most = self.options.place_hypotheses;
         let Some(refiner) = self.refiner else {
             let coarse = |place: &&Place| self.coarse(&place.part, &self.ranked(&place.part), most);
             let coarse: Result<Vec<Vec<Hypothesis>>, ViewsError> = places.par_iter().map(coarse).collect();
             let numbered = coarse?.into_iter().enumerate();
             return Ok(numbered
-                .flat_map(|(number, all)| all.into_iter().map(move |h| (number, h)))
+                .flat_map(|(number, all)| all.into_iter().map(move |h| (h, number)))
                 .collect());
         };
         type Started = (Hypothesis, Progress);
@@ -164,39 +177,34 @@ impl Views<'_> {
         for (number, (place, here)) in places.iter().zip(all).enumerate() {
             pool.extend(here.into_iter().map(|(hypothesis, progress)| {
                 let camera_from_object = place.part.crop.to_camera(&progress.best.pose);
-                (number, Hypothesis { camera_from_object, similarity: progress.best.score, ..hypothesis })
+                (Hypothesis { camera_from_object, similarity: progress.best.score, ..hypothesis }, number)
             }));
         }
         Ok(pool)
     }
 
-    /// Poses that are sorted by similarity, sorted by the product of it and of how similar the image is to the object rendered there. At one
-    /// place the most similar pose decides for all, so that their order is kept: these features are too coarse for it.
-    fn recognised(
+    /// Poses sorted by the product of their similarity and of how much more similar the image is there to the object rendered at the pose
+    /// than the image's places are on average: what they have in common with the object does not count.
+    fn recognised<T: Send>(
         &self,
-        poses: Vec<Hypothesis>,
+        poses: Vec<(Hypothesis, T)>,
+        places: &[Place],
         image: &RgbImage,
         camera: &Camera,
-    ) -> Result<Vec<Hypothesis>, ViewsError> {
-        // The best pose of each place, and the place of each pose.
-        let mut best: Vec<Hypothesis> = Vec::new();
-        let mut places: Vec<usize> = Vec::with_capacity(poses.len());
-        for pose in &poses {
-            places.push(best.iter().position(|best| self.one(camera, best, pose)).unwrap_or(best.len()));
-            if places.last() == Some(&best.len()) {
-                best.push(*pose);
-            }
-        }
+    ) -> Result<Vec<(Hypothesis, T)>, ViewsError> {
         let recogniser = self.extractor.recogniser();
-        let similar: Result<Vec<Option<f64>>, ViewsError> = best
-            .par_iter()
-            .map(|pose| recogniser.similarity(self.mesh, image, camera, &pose.camera_from_object))
-            .collect();
-        let similar = similar?;
-        let score = |(pose, place): (Hypothesis, usize)| {
-            (pose.similarity * similar[place].unwrap_or(0.0).max(0.0), pose)
+        let seen: Vec<&Recognised> = places.iter().filter_map(|place| place.recognised.as_ref()).collect();
+        let score = |(pose, other): (Hypothesis, T)| -> Result<(f64, (Hypothesis, T)), ViewsError> {
+            let compared = recogniser.compare(self.mesh, image, camera, &pose.camera_from_object)?;
+            let more = compared.map_or(0.0, |(view, here)| {
+                let elsewhere: f32 = seen.iter().map(|seen| view.similarity(seen)).sum();
+                f64::from(view.similarity(&here) - elsewhere / (seen.len() as f32 + UNLIKE)).max(0.0)
+            });
+            Ok((pose.similarity * more, (pose, other)))
         };
-        let mut scored: Vec<(f64, Hypothesis)> = poses.into_iter().zip(places).map(score).collect();
+        let scored: Result<Vec<(f64, (Hypothesis, T))>, ViewsError> =
+            poses.into_par_iter().map(score).collect();
+        let mut scored = scored?;
         scored.sort_by(|a, b| b.0.total_cmp(&a.0));
         Ok(scored.into_iter().map(|(_, pose)| pose).collect())
     }
@@ -361,22 +369,38 @@ mod tests {
     #[test]
     fn of_poses_that_agree_equally_the_one_on_the_object_comes_first() {
         let camera = Camera::new(570.0, 570.0, 319.5, 239.5, 640, 480).unwrap();
-        let (image, truth, _) = photographed(&camera);
+        let (image, truth, bbox) = photographed(&camera);
         let (extractor, mesh, options) = (Extractor::shipped().unwrap(), part(), ViewsOptions::default());
         let views = without_refiner(&extractor, &mesh, &[], &options);
-        let pose =
-            |camera_from_object| Hypothesis { camera_from_object, similarity: 0.6, inliers: 20, drawn: 0.0 };
         let beside = truth.with_translation(truth.translation() + Vec3::new(-0.3, 0.1, 0.0));
         let behind = truth.with_translation(-truth.translation());
-        let poses = [behind, beside, truth].map(pose).to_vec();
-        let sorted = views.recognised(poses, &image, &camera).unwrap();
-        assert_eq!(sorted.iter().map(|h| h.camera_from_object).collect::<Vec<_>>(), [truth, beside, behind]);
-        // At one place the order is kept.
-        let near = truth.with_translation(truth.translation() + Vec3::new(0.02, 0.0, 0.0));
-        let sorted = views.recognised([near, truth].map(pose).to_vec(), &image, &camera).unwrap();
-        assert_eq!(sorted[0].camera_from_object, near);
+        let place = |bbox: Rect| {
+            let part = Part::new(&extractor, &image, &camera, &bbox, 160).unwrap().unwrap();
+            Place::new(&extractor, bbox, part).unwrap()
+        };
+        let corners = [[40.0, 300.0], [300.0, 20.0], [20.0, 30.0], [420.0, 330.0], [430.0, 60.0]];
+        let places: Vec<Place> = corners.map(|[x, y]| place(Rect { x, y, ..bbox })).into();
+        let sorted = |poses: &[(Pose, f64)], places: &[Place]| -> Vec<Pose> {
+            let pose = |(camera_from_object, similarity): &(Pose, f64)| {
+                let camera_from_object = *camera_from_object;
+                (Hypothesis { camera_from_object, similarity: *similarity, inliers: 20, drawn: 0.0 }, ())
+            };
+            let poses = poses.iter().map(pose).collect();
+            let sorted = views.recognised(poses, places, &image, &camera).unwrap();
+            sorted.iter().map(|(h, ())| h.camera_from_object).collect()
+        };
+        let poses = [behind, beside, truth].map(|pose| (pose, 0.6));
+        assert_eq!(sorted(&poses, &places), [truth, beside, behind]);
+        // Also without places to compare with, and if the only place is the object's own.
+        assert_eq!(sorted(&poses, &[]), [truth, beside, behind]);
+        assert_eq!(sorted(&poses, &[place(bbox)]), [truth, beside, behind]);
         let similarity =
             |pose: &Pose| extractor.recogniser().similarity(&mesh, &image, &camera, pose).unwrap();
+        // What the image's places have in common with the object does not count.
+        let ratio = similarity(&beside).unwrap() / similarity(&truth).unwrap();
+        let poses = [(beside, 0.5), (truth, 0.8 * 0.5 * ratio)];
+        assert_eq!(sorted(&poses, &[]), [beside, truth]);
+        assert_eq!(sorted(&poses, &places), [truth, beside]);
         assert!(similarity(&truth).unwrap() > similarity(&beside).unwrap() + 0.1);
         assert_eq!(similarity(&behind), None);
     }
