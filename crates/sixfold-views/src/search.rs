@@ -5,6 +5,7 @@
 //!
 //! Proposals and their features belong to the image: they are computed once, for all objects searched in it.
 
+use std::collections::HashSet;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use rayon::prelude::*;
@@ -115,21 +116,10 @@ impl Views<'_> {
         let alike: Vec<&Place> = alike.into_iter().map(|(place, _)| place).collect();
         let mut pool = self.pool(&alike, instances)?;
         pool.sort_by(|a, b| b.0.similarity.total_cmp(&a.0.similarity));
-        // The first of all and, if several instances are requested, the first of each place.
-        let first = |poses: Vec<(Hypothesis, usize)>, most: usize| -> Vec<(Hypothesis, usize)> {
-            let mut seen = vec![false; alike.len()];
-            let mut rank = 0;
-            let chosen = |(_, number): &(Hypothesis, usize)| {
-                rank += 1;
-                let of_place = !std::mem::replace(&mut seen[*number], true);
-                rank <= most || (of_place && instances > 1)
-            };
-            poses.into_iter().filter(chosen).collect()
-        };
         let close = self.options.place_close;
-        let considered = first(pool, close.saturating_mul(CONSIDERED));
+        let considered = first(pool, close.saturating_mul(CONSIDERED), instances > 1);
         let considered = self.recognised(considered, places, image, camera)?;
-        let chosen = first(considered, close).into_iter();
+        let chosen = first(considered, close, instances > 1).into_iter();
         let mut chosen: Vec<(Hypothesis, Rect)> = chosen.map(|(h, number)| (h, alike[number].bbox)).collect();
         let prints = self.prints(keypoints, camera);
         chosen.extend(self.by_print(prints.as_ref(), camera, instances));
@@ -185,7 +175,7 @@ impl Views<'_> {
 
     /// Poses sorted by the product of their similarity and of how much more similar the image is there to the object rendered at the pose
     /// than the image's places are on average: what they have in common with the object does not count.
-    fn recognised<T: Send>(
+    fn recognised<T: Sync>(
         &self,
         poses: Vec<(Hypothesis, T)>,
         places: &[Place],
@@ -194,17 +184,16 @@ impl Views<'_> {
     ) -> Result<Vec<(Hypothesis, T)>, ViewsError> {
         let recogniser = self.extractor.recogniser();
         let seen: Vec<&Recognised> = places.iter().filter_map(|place| place.recognised.as_ref()).collect();
-        let score = |(pose, other): (Hypothesis, T)| -> Result<(f64, (Hypothesis, T)), ViewsError> {
+        let score = |(pose, _): &(Hypothesis, T)| -> Result<f64, ViewsError> {
             let compared = recogniser.compare(self.mesh, image, camera, &pose.camera_from_object)?;
             let more = compared.map_or(0.0, |(view, here)| {
                 let elsewhere: f32 = seen.iter().map(|seen| view.similarity(seen)).sum();
                 f64::from(view.similarity(&here) - elsewhere / (seen.len() as f32 + UNLIKE)).max(0.0)
             });
-            Ok((pose.similarity * more, (pose, other)))
+            Ok(pose.similarity * more)
         };
-        let scored: Result<Vec<(f64, (Hypothesis, T))>, ViewsError> =
-            poses.into_par_iter().map(score).collect();
-        let mut scored = scored?;
+        let scores: Result<Vec<f64>, ViewsError> = poses.par_iter().map(score).collect();
+        let mut scored: Vec<(f64, (Hypothesis, T))> = scores?.into_iter().zip(poses).collect();
         scored.sort_by(|a, b| b.0.total_cmp(&a.0));
         Ok(scored.into_iter().map(|(_, pose)| pose).collect())
     }
@@ -240,6 +229,16 @@ impl Views<'_> {
             _ => self.same(a, b),
         }
     }
+}
+
+/// The first `most` of some poses with the numbers of their places and, if `of_each` place, the first there.
+fn first(poses: Vec<(Hypothesis, usize)>, most: usize, of_each: bool) -> Vec<(Hypothesis, usize)> {
+    let mut seen = HashSet::new();
+    let chosen = |(rank, (_, number)): &(usize, (Hypothesis, usize))| {
+        let first_there = seen.insert(*number);
+        *rank < most || (of_each && first_there)
+    };
+    poses.into_iter().enumerate().filter(chosen).map(|(_, pose)| pose).collect()
 }
 
 /// Stops the refinement of all poses but the `kept` best and, if `of_each` place, the best there.
@@ -356,6 +355,22 @@ mod tests {
         assert_eq!(go_on(2, true), [true, false, true, true, false]);
         assert_eq!(go_on(4, false), [true, true, true, true, false]);
         assert_eq!(go_on(9, false), [true; 5]);
+    }
+
+    #[test]
+    fn the_first_poses_are_chosen_and_the_first_of_each_place() {
+        let pose = |number: usize| {
+            let camera_from_object = Pose::from_translation(Vec3::z());
+            (Hypothesis { camera_from_object, similarity: 0.5, inliers: 20, drawn: 0.0 }, number)
+        };
+        let numbers = |most: usize, of_each: bool| -> Vec<usize> {
+            let poses = [4, 4, 0, 4, 2, 0].map(pose).into();
+            first(poses, most, of_each).into_iter().map(|(_, number)| number).collect()
+        };
+        assert_eq!(numbers(2, false), [4, 4]);
+        assert_eq!(numbers(2, true), [4, 4, 0, 2]);
+        assert_eq!(numbers(1, true), [4, 0, 2]);
+        assert_eq!(numbers(9, false), [4, 4, 0, 4, 2, 0]);
     }
 
     #[test]
