@@ -1,7 +1,9 @@
 //! Search without a given region: a detector of any object proposes boxes, the object's templates select those similar to it, and
 //! poses are estimated there (the structure of CNOS, Nguyen et al. 2023, whose proposals and features come from foundation models; ours
 //! are small networks). Similarities are standardised for each view, over all boxes: `(s - mean) / deviation` (as in speaker verification, Z-norm,
-//! Auckenthaler et al. 2000). Of the poses, those come first at which the image is more similar to the object (`recognition`) than it is elsewhere.
+//! Auckenthaler et al. 2000). Of the poses, those come first at which the image is more similar to the object (`recognition`) than it is elsewhere:
+//! by `agreement (s - sum(s_i) / (n + 8))`, where `s` and `s_i` are the similarities of the render at the pose to the image there and to the `n` boxes
+//! (the subtraction as above; the product and the 8 are ours).
 //!
 //! Proposals and their features belong to the image: they are computed once, for all objects searched in it.
 
@@ -271,6 +273,16 @@ mod tests {
     use crate::templates::{TemplateOptions, make_templates};
     use sixfold_geometry::{Pose, Vec3};
 
+    /// A box of an image as a place.
+    fn place(extractor: &Extractor, image: &RgbImage, camera: &Camera, bbox: Rect) -> Place {
+        let part = Part::new(extractor, image, camera, &bbox, 160).unwrap().unwrap();
+        Place::new(extractor, bbox, part).unwrap()
+    }
+
+    /// Top left corners of boxes that do not show the object of [`photographed`].
+    const ELSEWHERE: [[f64; 2]; 5] =
+        [[40.0, 300.0], [300.0, 20.0], [20.0, 30.0], [420.0, 330.0], [430.0, 60.0]];
+
     #[test]
     fn the_place_that_shows_the_object_is_recognised_without_colours() {
         let camera = Camera::new(570.0, 570.0, 319.5, 239.5, 640, 480).unwrap();
@@ -283,13 +295,9 @@ mod tests {
         // Every second rotation is enough.
         let with = templates.iter().filter(|t| !t.appearance.cells.is_empty()).count();
         assert_eq!(2 * with, templates.len());
-        let place = |bbox: Rect| {
-            let part = Part::new(&extractor, &image, &camera, &bbox, 160).unwrap().unwrap();
-            Place::new(&extractor, bbox, part).unwrap()
-        };
+        let place = |bbox: Rect| place(&extractor, &image, &camera, bbox);
         let most = |place: &Place| templates.iter().map(|t| place.recognised_as(t)).fold(0.0, f32::max);
-        let corners = [[40.0, 300.0], [300.0, 20.0], [20.0, 30.0], [420.0, 330.0], [430.0, 60.0]];
-        let others = corners.map(|[x, y]| place(Rect { x, y, ..bbox }));
+        let others = ELSEWHERE.map(|[x, y]| place(Rect { x, y, ..bbox }));
         let places: Vec<Place> = [place(bbox)].into_iter().chain(others).collect();
         for other in &places[1..] {
             assert!(most(&places[0]) > most(other) + 0.1, "{} {}", most(&places[0]), most(other));
@@ -389,12 +397,8 @@ mod tests {
         let views = without_refiner(&extractor, &mesh, &[], &options);
         let beside = truth.with_translation(truth.translation() + Vec3::new(-0.3, 0.1, 0.0));
         let behind = truth.with_translation(-truth.translation());
-        let place = |bbox: Rect| {
-            let part = Part::new(&extractor, &image, &camera, &bbox, 160).unwrap().unwrap();
-            Place::new(&extractor, bbox, part).unwrap()
-        };
-        let corners = [[40.0, 300.0], [300.0, 20.0], [20.0, 30.0], [420.0, 330.0], [430.0, 60.0]];
-        let places: Vec<Place> = corners.map(|[x, y]| place(Rect { x, y, ..bbox })).into();
+        let place = |bbox: Rect| place(&extractor, &image, &camera, bbox);
+        let places: Vec<Place> = ELSEWHERE.map(|[x, y]| place(Rect { x, y, ..bbox })).into();
         let sorted = |poses: &[(Pose, f64)], places: &[Place]| -> Vec<Pose> {
             let pose = |(camera_from_object, similarity): &(Pose, f64)| {
                 let camera_from_object = *camera_from_object;
@@ -431,10 +435,7 @@ mod tests {
         let few = TemplateOptions { directions: 20, rotations: 4, ..TemplateOptions::default() };
         let templates = make_templates(&mesh, "part", mesh.diameter(), &extractor, &few).unwrap();
         let options = ViewsOptions::default();
-        let place = |image: &RgbImage| {
-            let part = Part::new(&extractor, image, &camera, &bbox, options.side).unwrap().unwrap();
-            Place::new(&extractor, bbox, part).unwrap()
-        };
+        let place = |image: &RgbImage| place(&extractor, image, &camera, bbox);
         let best = |place: &Place| templates.iter().map(|t| place.colour_of(t)).fold(0.0, f32::max);
         let [own, other, none] = [&image, &swapped, &grey].map(|image| best(&place(image)));
         assert!(own > other + 0.1 && none == 0.0, "{own} {other} {none}");
