@@ -16,7 +16,7 @@
 # Needs bash, python3, paths without spaces, and about 30 minutes of one core.
 set -euo pipefail
 
-PARTS=(evaluator demo single ppf_kinect ppf_xtion mttm_kinect mttm_xtion mttm_rows clutter pix2pose pix2pose_icp views auto detector grasp experience nol)
+PARTS=(evaluator demo single ppf_kinect ppf_xtion mttm_kinect mttm_xtion mttm_rows clutter pix2pose pix2pose_icp views auto detector detector_views grasp experience nol)
 # Asked for by name only: chapter 6 in small, about eight minutes more; twelve objects taught from photographs, about 25; with depth, 40.
 MORE=(dgcm teach teach_depth)
 
@@ -217,7 +217,7 @@ os.replace(path + ".new", path)
 PY
 }
 
-# Frames to measure on, as targets files: every eighth of LM-O, and every eighth that no training used.
+# Frames to measure on, as targets files: every eighth and fourth of LM-O, and every eighth that no training used.
 write_targets() {
     python3 - "$data/lmo/test_targets_bop19.json" data/lmo-training-frames.json "$work" <<'PY'
 import json
@@ -234,14 +234,15 @@ def frame(target):
     return target["scene_id"], target["im_id"]
 
 
-def write(name, frames):
-    chosen = set(sorted(frames)[::8])
+def write(name, frames, step=8):
+    chosen = set(sorted(frames)[::step])
     with open(f"{folder}/{name}", "w") as file:
         json.dump([t for t in targets if frame(t) in chosen], file, indent=1)
 
 
 write("every-8th.json", {frame(t) for t in targets})
 write("every-8th-untrained.json", {frame(t) for t in targets} - training)
+write("every-4th.json", {frame(t) for t in targets}, 4)
 PY
 }
 
@@ -407,6 +408,16 @@ digest = hashlib.sha256(json.dumps(found).encode()).hexdigest()
 json.dump({"count": len(found), "sha256_without_time": digest, "best": best}, open(sys.argv[2], "w"))
 PY
     freeze detector 0 scores=detector.json detections=detections-best.json
+}
+
+# Boxes and masks without training, by poses and by names of the proposals only.
+part_detector_views() {
+    local common="--dataset DIR/lmo --targets OUT/every-4th.json" way
+    for way in views quick; do
+        typed "sixfold detect --method views $common$([ $way = quick ] && echo " --quick") --out OUT/detections-$way.json"
+        typed "sixfold eval $common --detections OUT/detections-$way.json --min-score 0.5 --json OUT/detector-$way.json"
+    done
+    freeze detector_views 0 views=detector-views.json quick=detector-quick.json
 }
 
 # Grasps of real objects from one depth image, and how often the first one holds in simulation.

@@ -57,6 +57,8 @@ pub(crate) enum Command {
     /// Detect objects in colour images: boxes and masks, for `sixfold estimate` or any COCO tool
     #[command(hide = !NETWORKS, after_help = "Examples:\n  \
         sixfold detect --weights detector.safetensors --rgb c.png --out out\n  \
+        sixfold detect --method views --object mug.ply can.ply --unit mm --rgb c.png --out out\n  \
+        sixfold detect --method views --dataset lmo --out detections.json\n  \
         sixfold detect --weights detector.safetensors --dataset lmo --out detections.json")]
     Detect(Box<DetectArguments>),
     /// Score a result file against the ground truth of a BOP dataset

@@ -24,6 +24,23 @@ use crate::overruled::left_standing;
 use crate::record::{RunOptions, RunRecord};
 use crate::regions::RegionSource;
 
+/// An object of a dataset with its mesh and the folder of what methods derive from it.
+///
+/// # Errors
+/// [`RunError`] when its model is missing or broken.
+pub fn dataset_object(
+    dataset: &BopDataset,
+    id: u32,
+    infos: Option<&ModelsInfo>,
+    cache: &Cache,
+) -> Result<Object, RunError> {
+    let mesh = dataset.model(id, Models::Rendering)?;
+    let info = infos.and_then(|i| i.0.get(&id)).cloned().unwrap_or_else(|| ModelInfo::of_mesh(&mesh));
+    let folder = cache.of_mesh(&mesh, &info)?;
+    let name = format!("object {id} (obj_{id:06}.ply)");
+    Ok(Object { id: Some(id), folder, ..Object::of_mesh(name, mesh, info) })
+}
+
 /// A method, a dataset, and where the results go.
 pub struct DatasetRun<'a> {
     /// The method.
@@ -246,11 +263,7 @@ impl DatasetRun<'_> {
         infos: Option<&ModelsInfo>,
         events: &mut dyn FnMut(DatasetEvent<'_>) -> Result<(), RunError>,
     ) -> Result<Known, RunError> {
-        let mesh = self.dataset.model(id, Models::Rendering)?;
-        let info = infos.and_then(|i| i.0.get(&id)).cloned().unwrap_or_else(|| ModelInfo::of_mesh(&mesh));
-        let folder = self.cache.of_mesh(&mesh, &info)?;
-        let name = format!("object {id} (obj_{id:06}.ply)");
-        let object = Object { id: Some(id), folder, ..Object::of_mesh(name, mesh, info) };
+        let object = dataset_object(self.dataset, id, infos, self.cache)?;
         let prepared = self.estimator.prepare(&object)?;
         for note in prepared.notes() {
             events(DatasetEvent::Note(note.clone()))?;

@@ -3,6 +3,7 @@
 //! The file is written as a whole at the end. Until then the rows are in `FILE.part`, with a record beside it as for result files
 //! ([`RunOptions`]). Both are written at most once a second and removed when the run is complete.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
@@ -52,6 +53,9 @@ pub fn detections(
 pub struct FoundDetection {
     /// Id of the object.
     pub object_id: u32,
+    /// Its name, if it has one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub object: Option<String>,
     /// Confidence, 0 to 1.
     pub score: f64,
     /// x, y, width, height in pixels.
@@ -61,11 +65,12 @@ pub struct FoundDetection {
 }
 
 impl FoundDetection {
-    /// `None` for a detection without a box, which detectors do not return.
-    pub fn new(d: &Detection) -> Option<FoundDetection> {
+    /// A detection of one of these named objects, or of another. `None` for a detection without a box, which detectors do not return.
+    pub fn new(d: &Detection, names: &BTreeMap<u32, String>) -> Option<FoundDetection> {
         let b = d.bbox?;
         Some(FoundDetection {
             object_id: d.category_id,
+            object: names.get(&d.category_id).cloned(),
             score: d.score,
             bbox: [b.x, b.y, b.width, b.height],
             mask_pixels: d.segmentation.as_ref().map(Rle::area),

@@ -14,7 +14,7 @@ mod record;
 mod regions;
 mod table;
 
-pub use dataset::{DatasetEvent, DatasetRun, DatasetSummary, ImageResult, PosedObject};
+pub use dataset::{DatasetEvent, DatasetRun, DatasetSummary, ImageResult, PosedObject, dataset_object};
 pub use detection::{DetectionEvent, DetectionRun, DetectionSummary, FoundDetection, detections};
 pub use error::{OtherInput, OtherOptions, RunError, describe};
 pub use image::{FoundObject, FoundPose, ImageReport, ImageRun, depth_notes, without_overruled};

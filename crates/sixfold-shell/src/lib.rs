@@ -11,6 +11,8 @@ pub mod board;
 pub mod datasets;
 pub mod demo;
 pub mod depth_views;
+#[cfg(feature = "networks")]
+pub mod detectors;
 pub mod folder;
 pub mod found;
 pub mod frames;

@@ -1,6 +1,8 @@
 //! Images of poses: the object's silhouette, tinted surface, axes, name and confidence over the image. Uncertain poses have a
 //! thin, dashed outline and a dark label.
 
+use std::collections::BTreeMap;
+
 use sixfold_bop::{Detection, Rle};
 use sixfold_estimator::PoseEstimate;
 use sixfold_geometry::{Camera, DepthImage, Image, Mask, Pose, RgbImage, Vec3};
@@ -272,8 +274,9 @@ pub fn label(image: &mut RgbImage, [x, y]: [f64; 2], text: &str, color: [u8; 3])
     draw_labels(image, &[label]);
 }
 
-/// Detections over an image, boxes and tinted masks with number and score, the best on top.
-pub fn detections_over(image: &RgbImage, found: &[Detection]) -> RgbImage {
+/// Detections over an image, boxes and tinted masks with the object's name (or number) and score, the best on top.
+pub fn detections_over(image: &RgbImage, found: &[Detection], names: &BTreeMap<u32, String>) -> RgbImage {
+    let name = |id: u32| names.get(&id).cloned().unwrap_or_else(|| object_name(id));
     let mut out = image.clone();
     for d in found.iter().rev() {
         let color = color(d.category_id as usize);
@@ -297,7 +300,7 @@ pub fn detections_over(image: &RgbImage, found: &[Detection]) -> RgbImage {
         .filter_map(|d| {
             let b = d.bbox?;
             Some(Label {
-                text: caption(&object_name(d.category_id), d.score),
+                text: caption(&name(d.category_id), d.score),
                 of: [b.x, b.y, b.x + b.width, b.y + b.height],
                 color: color(d.category_id as usize),
                 is_sure: d.score >= SURE,
@@ -406,15 +409,15 @@ mod tests {
             segmentation: None,
             time: None,
         };
-        let image = RgbImage::filled(160, 120, [0; 3]);
+        let (image, none) = (RgbImage::filled(160, 120, [0; 3]), BTreeMap::new());
         let side = |score| {
-            let out = detections_over(&image, &[detection(score)]);
+            let out = detections_over(&image, &[detection(score)], &none);
             (45..95).filter(|y| out[(40, *y)] == color(0)).count()
         };
         assert_eq!(side(0.6), 50);
         assert!((15..40).contains(&side(0.4)), "{}", side(0.4));
-        let both = detections_over(&image, &[detection(0.6), detection(0.4)]);
-        let one = detections_over(&image, &[detection(0.6)]);
+        let both = detections_over(&image, &[detection(0.6), detection(0.4)], &none);
+        let one = detections_over(&image, &[detection(0.6)], &none);
         // The second label of the same box is placed beside the first one.
         assert!(count(&both, [0; 3]) + 400 < count(&one, [0; 3]));
     }

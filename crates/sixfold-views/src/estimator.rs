@@ -87,6 +87,22 @@ impl ViewsEstimator {
         ViewsEstimator { proposals: Some(detector), ..self }
     }
 
+    pub(crate) fn extractor(&self) -> &Extractor {
+        &self.extractor
+    }
+
+    pub(crate) fn views<'a>(&'a self, object: &'a ViewsObject) -> Views<'a> {
+        Views {
+            extractor: &self.extractor,
+            mesh: &object.view,
+            outline: &object.outline,
+            templates: &object.templates,
+            printed: Some(&object.printed),
+            refiner: self.refiner.as_deref(),
+            options: &self.options,
+        }
+    }
+
     /// A hash of everything that affects the templates of a mesh.
     fn key(&self, mesh: &Mesh, diameter: f64) -> u64 {
         let mut hash = Fnv1a::default();
@@ -129,7 +145,7 @@ impl ViewsEstimator {
 pub struct ViewsObject {
     name: String,
     mesh: Arc<Mesh>,
-    view: Mesh,
+    pub(crate) view: Mesh,
     outline: Mesh,
     templates: Vec<Template>,
     printed: Printed,
@@ -202,15 +218,7 @@ impl PoseEstimator for ViewsEstimator {
         let object: &ViewsObject = downcast(object, METHOD)?;
         self.options.check().map_err(EstimatorError::method)?;
         let image = query.rgb(METHOD)?;
-        let views = Views {
-            extractor: &self.extractor,
-            mesh: &object.view,
-            outline: &object.outline,
-            templates: &object.templates,
-            printed: Some(&object.printed),
-            refiner: self.refiner.as_deref(),
-            options: &self.options,
-        };
+        let views = self.views(object);
         let keypoints = (!object.printed.views.is_empty())
             .then(|| query.image_memo.get_or_default::<KeptKeypoints>().of_image(image));
         let keypoints = keypoints.as_deref();

@@ -19,6 +19,7 @@ mod choice;
 mod close;
 mod colour;
 mod crop;
+pub mod detector;
 mod direct;
 mod error;
 mod estimate;

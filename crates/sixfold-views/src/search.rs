@@ -12,7 +12,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use rayon::prelude::*;
 use sixfold_align::outline::projected_box;
-use sixfold_estimator::{EstimatorError, ObjectDetector};
+use sixfold_estimator::{EstimatorError, ObjectDetector, Region};
 use sixfold_geometry::{Camera, Rect, RgbImage};
 
 use crate::colour::Chroma;
@@ -44,18 +44,18 @@ const CONSIDERED: usize = 2;
 /// Number of places without any similarity that are added to those of an image: if there are only few, they may all be the object's own.
 const UNLIKE: f32 = 8.0;
 
-/// A box that may show an object, with the networks' features there.
+/// A region that may show an object, with the networks' features there.
 pub(crate) struct Place {
-    bbox: Rect,
+    pub(crate) region: Region,
     part: Part,
     chromas: Option<Vec<Chroma>>,
     recognised: Option<Recognised>,
 }
 
 impl Place {
-    fn new(extractor: &Extractor, bbox: Rect, part: Part) -> Result<Place, ViewsError> {
+    fn new(extractor: &Extractor, region: Region, part: Part) -> Result<Place, ViewsError> {
         let recognised = extractor.recogniser().features(&[&part.patch.data], part.patch.width)?.pop();
-        Ok(Place { bbox, chromas: part.chromas(), recognised, part })
+        Ok(Place { region, chromas: part.chromas(), recognised, part })
     }
 
     /// Similarity of what it shows to a template, 0 to 1.
@@ -87,20 +87,34 @@ impl Places {
         if let Some(places) = kept.as_ref() {
             return Ok(places.clone());
         }
-        let mut detected = detector.detect(image)?;
-        detected.sort_by(|a, b| b.region.score.total_cmp(&a.region.score));
-        detected.truncate(most);
-        let place = |bbox: Rect| -> Result<Option<Place>, ViewsError> {
-            let part = Part::new(extractor, image, camera, &bbox, side)?;
-            part.map(|part| Place::new(extractor, bbox, part)).transpose()
-        };
-        let places: Result<Vec<Option<Place>>, ViewsError> =
-            detected.par_iter().map(|d| place(d.region.bbox)).collect();
-        let places = Arc::new(places.map_err(EstimatorError::method)?.into_iter().flatten().collect());
+        let places = Arc::new(places(detector, extractor, image, camera, [most, side])?);
         *kept = Some(Arc::clone(&places));
         Ok(places)
     }
 }
+
+/// The proposals of a detector of any object in an image, by decreasing score, at most `most`, with features in crops of `side` pixels.
+pub(crate) fn places(
+    detector: &dyn ObjectDetector,
+    extractor: &Extractor,
+    image: &RgbImage,
+    camera: &Camera,
+    [most, side]: [usize; 2],
+) -> Result<Vec<Place>, EstimatorError> {
+    let mut detected = detector.detect(image)?;
+    detected.sort_by(|a, b| b.region.score.total_cmp(&a.region.score));
+    detected.truncate(most);
+    let place = |region: Region| -> Result<Option<Place>, ViewsError> {
+        let part = Part::new(extractor, image, camera, &region.bbox, side)?;
+        part.map(|part| Place::new(extractor, region, part)).transpose()
+    };
+    let places: Result<Vec<Option<Place>>, ViewsError> =
+        detected.into_par_iter().map(|d| place(d.region)).collect();
+    Ok(places.map_err(EstimatorError::method)?.into_iter().flatten().collect())
+}
+
+/// A pose with its score, [`Views::recognised`].
+pub(crate) type Scored<T> = (f64, (Hypothesis, T));
 
 impl Views<'_> {
     /// The object's poses in the places similar to it, best first, at most `instances`, no two of the same instance.
@@ -112,23 +126,18 @@ impl Views<'_> {
         keypoints: Option<&ImageKeypoints>,
         instances: usize,
     ) -> Result<Vec<Hypothesis>, ViewsError> {
-        let mut alike: Vec<(&Place, f32)> = places.iter().zip(self.place_similarities(places)).collect();
-        alike.sort_by(|a, b| b.1.total_cmp(&a.1));
-        alike.truncate(self.options.places.saturating_add(instances - 1));
-        let alike: Vec<&Place> = alike.into_iter().map(|(place, _)| place).collect();
-        let mut pool = self.pool(&alike, instances)?;
-        pool.sort_by(|a, b| b.0.similarity.total_cmp(&a.0.similarity));
-        let close = self.options.place_close;
-        let considered = first(pool, close.saturating_mul(CONSIDERED), instances > 1);
-        let considered = self.recognised(considered, places, image, camera)?;
-        let chosen = first(considered, close, instances > 1).into_iter();
-        let mut chosen: Vec<(Hypothesis, Rect)> = chosen.map(|(h, number)| (h, alike[number].bbox)).collect();
+        let alike = self.most_alike(places, self.options.places.saturating_add(instances - 1));
+        let located = self.located(&alike, places, image, camera, instances > 1)?;
+        let located = located.into_iter().map(|(_, pose)| pose).collect();
+        let chosen = first(located, self.options.place_close, instances > 1).into_iter();
+        let mut chosen: Vec<(Hypothesis, Rect)> =
+            chosen.map(|(h, number)| (h, alike[number].region.bbox)).collect();
         let prints = self.prints(keypoints, camera);
         chosen.extend(self.by_print(prints.as_ref(), camera, instances));
         let closer = self.closer_all(chosen, prints.as_ref(), image, camera)?;
         let found = self.recognised(closer.into_iter().map(|h| (h, ())).collect(), places, image, camera)?;
         let mut kept: Vec<Hypothesis> = Vec::new();
-        for (hypothesis, ()) in found {
+        for (_, (hypothesis, ())) in found {
             if kept.len() < instances && kept.iter().all(|k| !self.one(camera, k, &hypothesis)) {
                 kept.push(hypothesis);
             }
@@ -136,10 +145,32 @@ impl Views<'_> {
         Ok(kept)
     }
 
+    /// The places most similar to the object, at most `most`.
+    pub(crate) fn most_alike<'p>(&self, places: &'p [Place], most: usize) -> Vec<&'p Place> {
+        let mut alike: Vec<(&Place, f32)> = places.iter().zip(self.place_similarities(places)).collect();
+        alike.sort_by(|a, b| b.1.total_cmp(&a.1));
+        alike.into_iter().take(most).map(|(place, _)| place).collect()
+    }
+
+    /// Poses in the places `alike`, of all `places` of the image, each with its score and the number of its place, best first: those with which the
+    /// refiner agrees most and, if `of_each` place, its best.
+    pub(crate) fn located(
+        &self,
+        alike: &[&Place],
+        places: &[Place],
+        image: &RgbImage,
+        camera: &Camera,
+        of_each: bool,
+    ) -> Result<Vec<Scored<usize>>, ViewsError> {
+        let mut pool = self.pool(alike, of_each)?;
+        pool.sort_by(|a, b| b.0.similarity.total_cmp(&a.0.similarity));
+        let considered = first(pool, self.options.place_close.saturating_mul(CONSIDERED), of_each);
+        self.recognised(considered, places, image, camera)
+    }
+
     /// Poses in some places, each with the place's number. The refiner renders and compares all of them once; after each of the first iterations
-    /// only those at which the image agrees best go on, over all places together, and, if there may be several instances, the best of each
-    /// place (successive halving, Jamieson and Talwalkar 2016).
-    fn pool(&self, places: &[&Place], instances: usize) -> Result<Vec<(Hypothesis, usize)>, ViewsError> {
+    /// only those at which the image agrees best go on, over all places together, and, if `of_each` place, the best there (successive halving, Jamieson and Talwalkar 2016).
+    fn pool(&self, places: &[&Place], of_each: bool) -> Result<Vec<(Hypothesis, usize)>, ViewsError> {
         let most = self.options.place_hypotheses;
         let Some(refiner) = self.refiner else {
             let coarse = |place: &&Place| self.coarse(&place.part, &self.ranked(&place.part), most);
@@ -162,7 +193,7 @@ impl Views<'_> {
                 refiner.advance(self.extractor, self.mesh, &place.part.target(), &mut moving, nearest)
             })?;
             if let Some(kept) = KEPT.get(pass) {
-                stop_all_but(&mut all, *kept, instances > 1);
+                stop_all_but(&mut all, *kept, of_each);
             }
         }
         let mut pool = Vec::new();
@@ -183,7 +214,7 @@ impl Views<'_> {
         places: &[Place],
         image: &RgbImage,
         camera: &Camera,
-    ) -> Result<Vec<(Hypothesis, T)>, ViewsError> {
+    ) -> Result<Vec<Scored<T>>, ViewsError> {
         let recogniser = self.extractor.recogniser();
         let seen: Vec<&Recognised> = places.iter().filter_map(|place| place.recognised.as_ref()).collect();
         let score = |(pose, _): &(Hypothesis, T)| -> Result<f64, ViewsError> {
@@ -195,14 +226,14 @@ impl Views<'_> {
             Ok(pose.similarity * more)
         };
         let scores: Result<Vec<f64>, ViewsError> = poses.par_iter().map(score).collect();
-        let mut scored: Vec<(f64, (Hypothesis, T))> = scores?.into_iter().zip(poses).collect();
+        let mut scored: Vec<Scored<T>> = scores?.into_iter().zip(poses).collect();
         scored.sort_by(|a, b| b.0.total_cmp(&a.0));
-        Ok(scored.into_iter().map(|(_, pose)| pose).collect())
+        Ok(scored)
     }
 
     /// How much more similar the most similar template is to each place than to the other places, in standard deviations over the
     /// places: some views (plain, without edges) are similar to everything. On a subset of features: selects the places to examine further.
-    fn place_similarities(&self, places: &[Place]) -> Vec<f32> {
+    pub(crate) fn place_similarities(&self, places: &[Place]) -> Vec<f32> {
         let templates: Vec<&Template> =
             self.templates.iter().filter(|t| !t.appearance.cells.is_empty()).collect();
         let of = |place: &Place, template: &Template| {
@@ -276,7 +307,7 @@ mod tests {
     /// A box of an image as a place.
     fn place(extractor: &Extractor, image: &RgbImage, camera: &Camera, bbox: Rect) -> Place {
         let part = Part::new(extractor, image, camera, &bbox, 160).unwrap().unwrap();
-        Place::new(extractor, bbox, part).unwrap()
+        Place::new(extractor, Region::of_box(bbox), part).unwrap()
     }
 
     /// Top left corners of boxes that do not show the object of [`photographed`].
@@ -324,7 +355,12 @@ mod tests {
             for cell in features.chunks_exact_mut(CHANNELS) {
                 (cell[0], cell[number + 1]) = (common, own);
             }
-            Place { bbox, part, chromas: None, recognised: Some(Recognised { cells: 2, features }) }
+            Place {
+                region: Region::of_box(bbox),
+                part,
+                chromas: None,
+                recognised: Some(Recognised { cells: 2, features }),
+            }
         };
         let places = [place([0.9, 0.4], 0), place([0.8, 0.6], 1), place([0.8, 0.6], 2)];
         let few = TemplateOptions { directions: 1, rotations: 3, side: 32, ..TemplateOptions::default() };
@@ -406,7 +442,7 @@ mod tests {
             };
             let poses = poses.iter().map(pose).collect();
             let sorted = views.recognised(poses, places, &image, &camera).unwrap();
-            sorted.iter().map(|(h, ())| h.camera_from_object).collect()
+            sorted.iter().map(|(_, (h, ()))| h.camera_from_object).collect()
         };
         let poses = [behind, beside, truth].map(|pose| (pose, 0.6));
         assert_eq!(sorted(&poses, &places), [truth, beside, behind]);

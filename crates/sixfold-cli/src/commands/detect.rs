@@ -1,7 +1,9 @@
 //! `sixfold detect`: boxes and masks of a detector's objects, in single images (written at the end) or in all images of a
 //! dataset (resumable).
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::sync::Mutex;
 use std::time::Instant;
 
 use anyhow::{Context, Result, anyhow, bail};
@@ -10,12 +12,13 @@ use sixfold_bop::{BopDataset, Detection, write_detections};
 use sixfold_detect::detect::DetectOptions;
 use sixfold_detect::detector::TrainedDetector;
 use sixfold_detect::torchvision::existing_objects_file;
+use sixfold_estimator::ObjectDetector;
 use sixfold_geometry::RgbImage;
 use sixfold_io::read_rgb;
 use sixfold_runner::{DetectionEvent, DetectionRun, FoundDetection, RunOptions, detections};
 
-use super::detect_arguments::DetectArguments;
 use sixfold_shell::Outcome;
+use sixfold_shell::detectors::NumberedObjects;
 use sixfold_shell::folder::OutputFolder;
 use sixfold_shell::frames::excepted;
 use sixfold_shell::output::{report, write_atomically};
@@ -23,6 +26,9 @@ use sixfold_shell::overlay::detections_over;
 use sixfold_shell::pictures::Pictures;
 use sixfold_shell::progress::{Progress, interrupted};
 use sixfold_shell::ranges::without_duplicates;
+use sixfold_views::detector::ViewsDetectOptions;
+
+use super::detect_arguments::{DetectArguments, DetectMethod};
 
 #[derive(Serialize)]
 struct Many {
@@ -49,10 +55,38 @@ struct Whole {
     overlay: Option<PathBuf>,
 }
 
+/// A detector with what is said about its objects.
+struct Chosen {
+    detector: Box<dyn ObjectDetector>,
+    /// Names of the objects that have one.
+    names: BTreeMap<u32, String>,
+    /// Detections with a lower score are not drawn over a dataset's images.
+    sure: f64,
+}
+
 pub(crate) fn run(a: &DetectArguments) -> Result<Outcome> {
     without_duplicates("--ids", &a.ids)?;
     // The weights are hashed before they are read, so that a change in between is noticed.
-    let of_run = run_options(a);
+    let mut of_run = run_options(a);
+    let chosen = match a.method {
+        DetectMethod::Network => by_network(a)?,
+        DetectMethod::Views => by_views(a, &mut of_run)?,
+    };
+    match (&a.dataset, &a.rgb[..]) {
+        (Some(root), _) => in_dataset(a, &chosen, root, &of_run),
+        (None, [file]) => in_image(a, &chosen, file),
+        (None, []) => bail!("give --rgb FILE or --dataset DIR"),
+        (None, files) => in_images(a, &chosen, files),
+    }
+}
+
+/// A trained detector, or that of any object.
+fn by_network(a: &DetectArguments) -> Result<Chosen> {
+    for (option, given) in [("--object", !a.objects.is_empty()), ("--quick", a.quick)] {
+        if given {
+            bail!("{option} is no option of --method network, but of --method views");
+        }
+    }
     let detector = match &a.weights {
         Some(weights) => TrainedDetector::load(weights)?,
         None => TrainedDetector::proposals().context("the detector within the program")?,
@@ -75,19 +109,70 @@ pub(crate) fn run(a: &DetectArguments) -> Result<Outcome> {
         masks: !a.no_masks,
     };
     options.check().map_err(|message| anyhow!(message))?;
-    let detector = detector.with_options(options);
-    match (&a.dataset, &a.rgb[..]) {
-        (Some(root), _) => in_dataset(a, &detector, root, &of_run),
-        (None, [file]) => in_image(a, &detector, file),
-        (None, []) => bail!("give --rgb FILE or --dataset DIR"),
-        (None, files) => in_images(a, &detector, files),
+    let sure = f64::from(detector.model().usage().threshold);
+    let detector = Box::new(detector.with_options(options));
+    Ok(Chosen { detector, names: BTreeMap::new(), sure })
+}
+
+/// The detector of objects by their views.
+fn by_views(a: &DetectArguments, of_run: &mut RunOptions) -> Result<Chosen> {
+    for (option, given) in [("--weights", a.weights.is_some()), ("--scales", a.scales.is_some())] {
+        if given {
+            bail!("{option} is no option of --method views, but of --method network");
+        }
     }
+    let own = ViewsDetectOptions::default();
+    let options = ViewsDetectOptions {
+        threshold: a.threshold.map_or(if a.dataset.is_some() { 0.0 } else { own.threshold }, f64::from),
+        overlap: a.overlap.map_or(own.overlap, f64::from),
+        per_object: a.per_object.unwrap_or(own.per_object),
+        max_detections: a.max_detections.unwrap_or(own.max_detections),
+        poses: !a.quick,
+        masks: !a.no_masks,
+    };
+    options.check()?;
+    let cache = a.cache.cache();
+    let (objects, names) = match &a.dataset {
+        Some(root) => {
+            let objects = NumberedObjects::of_dataset(&BopDataset::open(root, &a.split)?, &a.ids, &cache)?;
+            // The models decide about the detections, so a run resumes only with the same ones.
+            objects
+                .files
+                .iter()
+                .for_each(|(id, file)| of_run.add(&format!("object {id}"), &file.to_string_lossy()));
+            (objects, BTreeMap::new())
+        }
+        None if a.objects.is_empty() => {
+            bail!("--method views needs --object NAME_OR_MESH ...: what is to be detected?")
+        }
+        None => {
+            let objects = NumberedObjects::of_names(&a.objects, a.unit, &a.store.store(), &cache)?;
+            let names = objects.names();
+            (objects, names)
+        }
+    };
+    let mut detector = objects.detector(options)?;
+    for id in &a.ids {
+        detector.check_object(*id).with_context(|| "--ids".to_string())?;
+    }
+    if let ([_], None) = (&a.rgb[..], &a.dataset) {
+        let progress = Mutex::new(Progress::new("objects", names.len()));
+        let named = names.clone();
+        detector.searched = Some(Box::new(move |id| {
+            if let Ok(mut progress) = progress.lock() {
+                progress.step(named.get(&id).cloned().unwrap_or_default());
+            }
+        }));
+    }
+    Ok(Chosen { detector: Box::new(detector), names, sure: own.threshold })
 }
 
 /// The options on which the detections of an image depend. The choice of images is not among them.
 fn run_options(a: &DetectArguments) -> RunOptions {
     // All fields are listed, so that a new one has to be considered.
     let DetectArguments {
+        method,
+        quick,
         weights,
         dataset,
         split,
@@ -98,6 +183,10 @@ fn run_options(a: &DetectArguments) -> RunOptions {
         max_detections,
         scales,
         no_masks,
+        objects: _,
+        unit: _,
+        store: _,
+        cache: _,
         rgb: _,
         targets: _,
         except: _,
@@ -106,6 +195,8 @@ fn run_options(a: &DetectArguments) -> RunOptions {
         json: _,
     } = a;
     let mut options = RunOptions::default();
+    options.add("method", &format!("{method:?}"));
+    options.add("quick", &quick.to_string());
     let weights = weights.as_deref();
     options.add("weights", &weights.map_or("any object".into(), Path::to_string_lossy));
     if let Some(file) = weights.and_then(existing_objects_file) {
@@ -135,7 +226,7 @@ fn outcome(detections: usize, skipped: &[String]) -> Outcome {
 /// Reads and searches an image; returns it, its detections under the number `image`, and the seconds it took.
 fn detect_file(
     a: &DetectArguments,
-    detector: &TrainedDetector,
+    detector: &dyn ObjectDetector,
     file: &Path,
     image: u32,
 ) -> Result<(RgbImage, Vec<Detection>, f64)> {
@@ -145,13 +236,13 @@ fn detect_file(
     Ok((rgb, found, start.elapsed().as_secs_f64()))
 }
 
-fn in_image(a: &DetectArguments, detector: &TrainedDetector, file: &Path) -> Result<Outcome> {
+fn in_image(a: &DetectArguments, chosen: &Chosen, file: &Path) -> Result<Outcome> {
     let mut folder = a.out.as_deref().map(OutputFolder::take).transpose()?;
     let names = ["detections.json", "overlay.png", "result.json"];
     let paths = folder.as_mut().map(|f| f.files(&names)).transpose()?;
-    let (image, found, seconds) = detect_file(a, detector, file, 0)?;
+    let (image, found, seconds) = detect_file(a, chosen.detector.as_ref(), file, 0)?;
     let whole = Whole {
-        detections: found.iter().filter_map(FoundDetection::new).collect(),
+        detections: found.iter().filter_map(|d| FoundDetection::new(d, &chosen.names)).collect(),
         seconds,
         file: paths.as_ref().map(|p| p[0].clone()),
         overlay: paths.as_ref().map(|p| p[1].clone()),
@@ -165,7 +256,8 @@ fn in_image(a: &DetectArguments, detector: &TrainedDetector, file: &Path) -> Res
         for d in &whole.detections {
             let numbers: Vec<String> = d.bbox.iter().map(|v| format!("{v:.1}")).collect();
             let mask = d.mask_pixels.map_or("-".to_string(), |m| format!("{m} px"));
-            println!("{:>8} {:>8.3} {:>32} {mask:>10}", d.object_id, d.score, numbers.join(", "));
+            let object = d.object.clone().unwrap_or_else(|| d.object_id.to_string());
+            println!("{object:>8} {:>8.3} {:>32} {mask:>10}", d.score, numbers.join(", "));
         }
         if whole.detections.is_empty() {
             println!("nothing found");
@@ -177,27 +269,27 @@ fn in_image(a: &DetectArguments, detector: &TrainedDetector, file: &Path) -> Res
     })?;
     let mut pictures = Pictures::of(folder);
     if whole.overlay.is_some() {
-        pictures.write("overlay.png", &detections_over(&image, &found));
+        pictures.write("overlay.png", &detections_over(&image, &found, &chosen.names));
     }
     Ok(pictures.outcome(outcome(whole.detections.len(), &[])))
 }
 
 /// Several images outside datasets; in `detections.json` their ids are their indices, from 1.
-fn in_images(a: &DetectArguments, detector: &TrainedDetector, files: &[PathBuf]) -> Result<Outcome> {
+fn in_images(a: &DetectArguments, chosen: &Chosen, files: &[PathBuf]) -> Result<Outcome> {
     let mut folder = a.out.as_deref().map(OutputFolder::take).transpose()?;
     let file = folder.as_mut().map(|f| f.file("detections.json")).transpose()?;
     let mut pictures = Pictures::of(folder);
     let mut progress = Progress::new("images", files.len());
     let (mut images, mut all, mut skipped) = (vec![], vec![], vec![]);
     for (number, file) in (1..).zip(files) {
-        match detect_file(a, detector, file, number) {
+        match detect_file(a, chosen.detector.as_ref(), file, number) {
             Ok((image, found, seconds)) => {
                 if a.out.is_some() {
                     let stem = file.file_stem().unwrap_or_default().to_string_lossy();
                     let name = format!("overlays/{number:06}_{stem}.png");
-                    pictures.write(&name, &detections_over(&image, &found));
+                    pictures.write(&name, &detections_over(&image, &found, &chosen.names));
                 }
-                let detections = found.iter().filter_map(FoundDetection::new).collect();
+                let detections = found.iter().filter_map(|d| FoundDetection::new(d, &chosen.names)).collect();
                 images.push(OneOfMany { image: number, file: file.clone(), detections, seconds });
                 all.extend(found);
             }
@@ -229,12 +321,7 @@ fn in_images(a: &DetectArguments, detector: &TrainedDetector, files: &[PathBuf])
     Ok(outcome(many.detections, &many.skipped))
 }
 
-fn in_dataset(
-    a: &DetectArguments,
-    detector: &TrainedDetector,
-    root: &Path,
-    options: &RunOptions,
-) -> Result<Outcome> {
+fn in_dataset(a: &DetectArguments, chosen: &Chosen, root: &Path, options: &RunOptions) -> Result<Outcome> {
     let out = a.out.as_deref().ok_or_else(|| anyhow!("--out FILE.json is missing"))?;
     if out.extension().is_none_or(|e| e != "json") {
         bail!("--out: found {}, expected a file that ends in .json", out.display());
@@ -248,16 +335,17 @@ fn in_dataset(
     let images: Vec<(u32, u32)> = images.into_iter().collect();
     let mut progress = Progress::new("images", images.len());
     let mut pictures = Pictures::of(a.overlays.as_deref().map(OutputFolder::take).transpose()?);
-    let sure = f64::from(detector.model().usage().threshold);
+    let detector = chosen.detector.as_ref();
     let run = DetectionRun { detector, dataset: &dataset, images: &images, ids: &a.ids, options };
     let summary = run.run(out, interrupted(), &mut |event| match event {
         DetectionEvent::Image { image, earlier: true } => progress.step(format!("{image} was done")),
         DetectionEvent::Image { image, earlier: false } => progress.step(image),
         DetectionEvent::Found { scene, im_id, image, detections } => {
             if a.overlays.is_some() {
-                let shown: Vec<Detection> = detections.iter().filter(|d| d.score >= sure).cloned().collect();
+                let shown: Vec<Detection> =
+                    detections.iter().filter(|d| d.score >= chosen.sure).cloned().collect();
                 let name = format!("{:06}_{im_id:06}.png", scene.scene_id);
-                pictures.write(&name, &detections_over(image, &shown));
+                pictures.write(&name, &detections_over(image, &shown, &chosen.names));
             }
         }
     });

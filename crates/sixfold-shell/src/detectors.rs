@@ -1,0 +1,96 @@
+//! Detection of objects by their views: the objects that a command names, and the detector of them.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use anyhow::{Context, Result, bail};
+use sixfold_bop::{BopDataset, Models};
+use sixfold_detect::detect::DetectOptions;
+use sixfold_detect::detector::TrainedDetector;
+use sixfold_estimator::{Cache, Object, ObjectStore, PoseEstimator};
+use sixfold_mesh::Unit;
+use sixfold_runner::dataset_object;
+use sixfold_views::detector::{ViewsDetectOptions, ViewsDetector};
+use sixfold_views::estimator::ViewsEstimator;
+
+use crate::progress::Progress;
+
+/// Objects by the numbers under which they are reported.
+pub struct NumberedObjects {
+    objects: BTreeMap<u32, Object>,
+    /// The files of their meshes, if they are of a dataset.
+    pub files: BTreeMap<u32, PathBuf>,
+}
+
+impl NumberedObjects {
+    /// The objects of a dataset: all that its `models_info.json` lists, or those of `ids`.
+    ///
+    /// # Errors
+    /// When a model is missing or broken, or the dataset has no `models_info.json` and `ids` is empty.
+    pub fn of_dataset(dataset: &BopDataset, ids: &[u32], cache: &Cache) -> Result<NumberedObjects> {
+        let infos = dataset.models_info(Models::Rendering)?;
+        let all = infos.as_ref().map(|infos| infos.0.keys().copied().collect::<Vec<u32>>());
+        let ids = match (ids, all) {
+            ([], None) => bail!(
+                "{}: expected models/models_info.json, which lists the objects to detect; found none: name some with --ids",
+                dataset.root().display()
+            ),
+            ([], Some(all)) => all,
+            (ids, _) => ids.to_vec(),
+        };
+        let object = |id: &u32| Ok((*id, dataset_object(dataset, *id, infos.as_ref(), cache)?));
+        let objects = ids.iter().map(object).collect::<Result<_>>()?;
+        let files = ids.iter().map(|id| (*id, dataset.model_path(*id, Models::Rendering))).collect();
+        Ok(NumberedObjects { objects, files })
+    }
+
+    /// Mesh files and stored objects, numbered from 1 in the order of their names.
+    ///
+    /// # Errors
+    /// When there is no such object, or it cannot be read.
+    pub fn of_names(
+        names: &[String],
+        unit: Option<Unit>,
+        store: &ObjectStore,
+        cache: &Cache,
+    ) -> Result<NumberedObjects> {
+        let mut objects = BTreeMap::new();
+        for (id, name) in (1..).zip(names) {
+            let (object, note) = store.find(name, unit, cache)?;
+            if let Some(note) = note {
+                eprintln!("note: {note}");
+            }
+            objects.insert(id, object);
+        }
+        Ok(NumberedObjects { objects, files: BTreeMap::new() })
+    }
+
+    /// Their names.
+    pub fn names(&self) -> BTreeMap<u32, String> {
+        self.objects.iter().map(|(id, object)| (*id, object.name.clone())).collect()
+    }
+
+    /// A detector of them by their views, which are rendered first unless they are kept in the cache.
+    ///
+    /// # Errors
+    /// When an object cannot be rendered.
+    pub fn detector(&self, options: ViewsDetectOptions) -> Result<ViewsDetector> {
+        let estimator = ViewsEstimator::shipped().context("the network within the program")?;
+        let proposals = TrainedDetector::proposals().context("the detector within the program")?;
+        let of_proposals = DetectOptions { masks: options.masks && !options.poses, ..*proposals.options() };
+        let proposals = proposals.with_options(of_proposals);
+        let mut progress = Progress::new("objects rendered", self.objects.len());
+        let mut prepared = BTreeMap::new();
+        for (id, object) in &self.objects {
+            let one = estimator.prepare(object)?;
+            one.notes().iter().for_each(|note| eprintln!("note: {note}"));
+            prepared.insert(*id, one);
+            progress.step(object.name.clone());
+        }
+        progress.finish();
+        let mut detector = ViewsDetector::new(estimator, Arc::new(proposals), prepared);
+        detector.options = options;
+        Ok(detector)
+    }
+}
