@@ -217,7 +217,7 @@ os.replace(path + ".new", path)
 PY
 }
 
-# Frames to measure on, as targets files: every eighth and fourth of LM-O, and every eighth that no training used.
+# Frames to measure on, as targets files: every eighth of LM-O, and every eighth that no training used.
 write_targets() {
     python3 - "$data/lmo/test_targets_bop19.json" data/lmo-training-frames.json "$work" <<'PY'
 import json
@@ -234,15 +234,14 @@ def frame(target):
     return target["scene_id"], target["im_id"]
 
 
-def write(name, frames, step=8):
-    chosen = set(sorted(frames)[::step])
+def write(name, frames):
+    chosen = set(sorted(frames)[::8])
     with open(f"{folder}/{name}", "w") as file:
         json.dump([t for t in targets if frame(t) in chosen], file, indent=1)
 
 
 write("every-8th.json", {frame(t) for t in targets})
 write("every-8th-untrained.json", {frame(t) for t in targets} - training)
-write("every-4th.json", {frame(t) for t in targets}, 4)
 PY
 }
 
@@ -412,7 +411,7 @@ PY
 
 # Boxes and masks without training, by poses and by names of the proposals only.
 part_detector_views() {
-    local common="--dataset DIR/lmo --targets OUT/every-4th.json" way
+    local common="--dataset DIR/lmo" way
     for way in views quick; do
         typed "sixfold detect --method views $common$([ $way = quick ] && echo " --quick") --out OUT/detections-$way.json"
         typed "sixfold eval $common --detections OUT/detections-$way.json --min-score 0.5 --json OUT/detector-$way.json"

@@ -1,18 +1,26 @@
-//! `Detector`: finds boxes and masks of known objects in an image.
+//! `Detector` and `ViewsDetector`: boxes and masks of known objects in an image, by a trained network or by views of their meshes.
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 
 use numpy::{PyArray1, PyArray2};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
-use pyo3::types::PyType;
+use pyo3::types::{PyDict, PyType};
 use sixfold::detect::detect::DetectOptions;
+use sixfold::detect::detector::TrainedDetector;
 use sixfold::detect::model::{DetectorModel, ModelError};
+use sixfold::estimator::{EstimatorError, Object, ObjectDetector, PoseEstimator, Region};
+use sixfold::geometry::{Mask, Rect};
 use sixfold::nn::weights::WeightsError;
+use sixfold::views::detector::{ViewsDetectOptions, ViewsDetector};
+use sixfold::views::estimator::ViewsEstimator;
 
 use crate::arrays::{self, about, bad, whole};
+use crate::estimator::{estimator_error, shape_of};
 use crate::guard::{interruptible, os_error};
+use crate::training::file_or_value;
 
 fn model_error(error: ModelError) -> PyErr {
     match &error {
@@ -27,15 +35,24 @@ pub(crate) struct DetectedObject {
     /// The object's id.
     #[pyo3(get)]
     object_id: u32,
-    /// Confidence, 0 to 1: the expected overlap of this box with the object's true box.
+    /// Confidence, 0 to 1. Detector: the expected overlap of this box with the object's true box; ViewsDetector: the probability that
+    /// this overlap (intersection over union) is at least a half.
     #[pyo3(get)]
-    score: f32,
+    score: f64,
     /// Box of the visible part, (4,) float64: x, y, width, height in pixels.
     #[pyo3(get)]
     bbox: Py<PyArray1<f64>>,
     /// Mask of the visible part, (H, W) bool; None without masks.
     #[pyo3(get)]
     mask: Option<Py<PyArray2<bool>>>,
+}
+
+impl DetectedObject {
+    fn new(py: Python<'_>, object_id: u32, score: f64, b: Rect, mask: Option<Mask>) -> PyResult<Self> {
+        let mask = mask.map(|mask| Ok::<_, PyErr>(arrays::from_image(py, mask)?.unbind())).transpose()?;
+        let bbox = PyArray1::from_vec(py, vec![b.x, b.y, b.width, b.height]).unbind();
+        Ok(DetectedObject { object_id, score, bbox, mask })
+    }
 }
 
 #[pymethods]
@@ -129,16 +146,7 @@ impl Detector {
             if wanted.as_ref().is_some_and(|ids| !ids.contains(&object_id)) {
                 continue;
             }
-            let b = d.bbox;
-            out.push(DetectedObject {
-                object_id,
-                score: d.score,
-                bbox: PyArray1::from_vec(py, vec![b.x, b.y, b.width, b.height]).unbind(),
-                mask: d
-                    .mask
-                    .map(|mask| Ok::<_, PyErr>(arrays::from_image(py, mask)?.unbind()))
-                    .transpose()?,
-            });
+            out.push(DetectedObject::new(py, object_id, f64::from(d.score), d.bbox, d.mask)?);
         }
         Ok(out)
     }
@@ -146,6 +154,108 @@ impl Detector {
     fn __repr__(&self) -> String {
         let ids: Vec<String> = self.object_ids().iter().map(u32::to_string).collect();
         format!("<Detector: objects {}>", ids.join(", "))
+    }
+}
+
+/// Finds objects in colour images by rendered views of their meshes, without training for them.
+///
+/// objects: a dict from ids to Meshes. A detector of any object proposes boxes; in those most similar to an object's views its pose is
+/// estimated, which gives box and mask, without what detections with higher scores hide. Objects compete for the same part of an image, so
+/// give all that may be there. poses=False: keep the proposed boxes and masks and only name them; several times as fast, but less exact.
+/// masks=False: compute no masks. threshold: minimum score, 0 to 1. overlap: if two boxes of an object have a larger intersection over
+/// union, 0 to 1, the one with the lower score is left out. per_object, max_detections: maximum number of detections of each object and of
+/// all. Rendering an object takes up to 20 s. Ctrl-C interrupts it.
+///
+/// Raises ValueError for no objects, a mesh without faces or an option out of range.
+///
+/// >>> detector = ViewsDetector({1: mug, 2: can})  # doctest: +SKIP
+/// >>> detector(rgb)  # doctest: +SKIP
+/// [<DetectedObject: object 2, score 0.936>]
+#[pyclass(name = "ViewsDetector", module = "sixfold", frozen)]
+pub(crate) struct PyViewsDetector {
+    detector: Arc<ViewsDetector>,
+    ids: Vec<u32>,
+}
+
+#[pymethods]
+impl PyViewsDetector {
+    #[new]
+    #[pyo3(signature = (objects, *, poses=true, masks=true, threshold=0.5, overlap=0.5, per_object=100, max_detections=100))]
+    #[allow(clippy::too_many_arguments)]
+    fn new(
+        py: Python<'_>,
+        objects: &Bound<'_, PyDict>,
+        poses: bool,
+        masks: bool,
+        threshold: f64,
+        overlap: f64,
+        per_object: i64,
+        max_detections: i64,
+    ) -> PyResult<Self> {
+        let mut meshes = BTreeMap::new();
+        for (id, mesh) in objects {
+            let number = id.extract::<u32>();
+            let number =
+                number.map_err(|_| bad("objects", "whole numbers from 0 as keys", id.to_string()))?;
+            meshes.insert(number, shape_of(py, &mesh)?);
+        }
+        if meshes.is_empty() {
+            return Err(bad("objects", "at least one Mesh by its id", "none"));
+        }
+        let options = ViewsDetectOptions {
+            threshold: f64::from(fraction("threshold", threshold)?),
+            overlap: f64::from(fraction("overlap", overlap)?),
+            per_object: whole("per_object", per_object, 1)?,
+            max_detections: whole("max_detections", max_detections, 1)?,
+            poses,
+            masks,
+        };
+        let ids = meshes.keys().copied().collect();
+        let estimator = interruptible(py, |_| ViewsEstimator::shipped())?;
+        let estimator = estimator.map_err(|error| file_or_value(&error))?;
+        let proposals = interruptible(py, |_| TrainedDetector::proposals())?;
+        let proposals = proposals.map_err(|error| file_or_value(&error))?;
+        let own = DetectOptions { masks: masks && !poses, ..*proposals.options() };
+        let proposals = Arc::new(proposals.with_options(own));
+        let detector = interruptible(py, move |stop| -> Result<_, EstimatorError> {
+            let mut prepared = BTreeMap::new();
+            for (id, (mesh, info)) in meshes {
+                stop.check();
+                let name = format!("object {id}");
+                let object = Object { name, id: Some(id), mesh: Some(mesh), info: Some(info), folder: None };
+                prepared.insert(id, estimator.prepare(&object)?);
+            }
+            let mut detector = ViewsDetector::new(estimator, proposals, prepared);
+            detector.options = options;
+            Ok(detector)
+        })?;
+        Ok(PyViewsDetector { detector: Arc::new(detector.map_err(estimator_error)?), ids })
+    }
+
+    /// Ids of the objects.
+    #[getter]
+    fn object_ids(&self) -> Vec<u32> {
+        self.ids.clone()
+    }
+
+    /// Searches for the objects in an image: a list of DetectedObject, best first.
+    ///
+    /// rgb: (H, W, 3) uint8, of any size; no camera is needed. An object takes about a second. The same input gives the same result with any
+    /// number of threads. Ctrl-C interrupts it.
+    ///
+    /// Raises ValueError for an image without pixels.
+    fn __call__(&self, py: Python<'_>, rgb: &Bound<'_, PyAny>) -> PyResult<Vec<DetectedObject>> {
+        let image = arrays::rgb("rgb", rgb)?;
+        let detector = self.detector.clone();
+        let found = interruptible(py, move |_| detector.detect(&image))?.map_err(about("rgb"))?;
+        let object =
+            |(id, region): (u32, Region)| DetectedObject::new(py, id, region.score, region.bbox, region.mask);
+        found.into_iter().map(|d| object((d.object_id, d.region))).collect()
+    }
+
+    fn __repr__(&self) -> String {
+        let ids: Vec<String> = self.ids.iter().map(u32::to_string).collect();
+        format!("<ViewsDetector: objects {}>", ids.join(", "))
     }
 }
 

@@ -366,7 +366,7 @@ impl PyEstimator {
 }
 
 /// A mesh with the properties of its object.
-fn shape_of(py: Python<'_>, object: &Bound<'_, PyAny>) -> PyResult<(Arc<Mesh>, ModelInfo)> {
+pub(crate) fn shape_of(py: Python<'_>, object: &Bound<'_, PyAny>) -> PyResult<(Arc<Mesh>, ModelInfo)> {
     let found = || bad("object", "a Mesh", object.get_type().to_string());
     let mesh = object.cast::<PyMesh>().map_err(|_| found())?.get();
     Ok((mesh.mesh.clone(), free(py, || mesh.info())?))
@@ -426,7 +426,7 @@ fn box_of(camera: &Camera, given: &Bound<'_, PyAny>) -> PyResult<Rect> {
 }
 
 /// The Python exception for a search that is not possible.
-fn estimator_error(error: EstimatorError) -> PyErr {
+pub(crate) fn estimator_error(error: EstimatorError) -> PyErr {
     let named = |argument: &str, source: &(dyn std::error::Error + 'static)| {
         PyValueError::new_err(format!("{argument}: {}", describe(source)))
     };

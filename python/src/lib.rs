@@ -79,6 +79,7 @@ fn _sixfold(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<experience::ExperienceStore>()?;
     module.add_class::<experienced::PyExperience>()?;
     module.add_class::<detector::Detector>()?;
+    module.add_class::<detector::PyViewsDetector>()?;
     module.add_class::<detector::DetectedObject>()?;
     module.add_class::<photograph::PyPhotograph>()?;
     module.add_class::<photographs::RefinedPoses>()?;

@@ -119,3 +119,43 @@ def test_wrong_use(detector, rgb, weights, tmp_path):
     with pytest.raises(ValueError, match="detect"):
         sixfold.Detector.load(weights)
     assert 0 < detector.threshold < 1 and detector.card["architecture"].startswith("detect")
+
+
+@pytest.fixture(scope="module")
+def by_views(demo):
+    dataset = bop.Dataset(demo)
+    return sixfold.ViewsDetector({i: dataset.model(i) for i in (5, 9)}, threshold=0.2)
+
+
+def test_views_find_objects_without_training(by_views, rgb, boxes):
+    found = by_views(rgb)
+    assert [d.score for d in found] == sorted((d.score for d in found), reverse=True)
+    assert by_views.object_ids == [5, 9] and "5, 9" in repr(by_views)
+    for i in (5, 9):
+        first = next(d for d in found if d.object_id == i)
+        assert overlap(first.bbox, boxes[i]) > 0.7 and 0.5 < first.score <= 1
+        assert first.mask.shape == rgb.shape[:2]
+        rows, columns = np.nonzero(first.mask)
+        assert [columns.min(), rows.min(), np.ptp(columns), np.ptp(rows)] == first.bbox.tolist()
+
+
+def test_views_name_boxes_quickly(demo, rgb, boxes):
+    dataset = bop.Dataset(demo)
+    detector = sixfold.ViewsDetector({9: dataset.model(9)}, poses=False, masks=False, threshold=0, max_detections=7)
+    found = detector(rgb)
+    assert len(found) == 7 and all(d.object_id == 9 and d.mask is None for d in found)
+    assert overlap(found[0].bbox, boxes[9]) > 0.5
+
+
+def test_views_need_objects_and_options_in_range(demo):
+    mesh = bop.Dataset(demo).model(9)
+    for objects, options, words in [
+        ({}, {}, "at least one Mesh"),
+        ({9: "mesh"}, {}, "a Mesh"),
+        ({-1: mesh}, {}, "whole numbers"),
+        ({9: mesh}, {"threshold": 1.5}, "threshold"),
+        ({9: mesh}, {"overlap": float("nan")}, "overlap"),
+        ({9: mesh}, {"per_object": 0}, "per_object"),
+    ]:
+        with pytest.raises(ValueError, match=words):
+            sixfold.ViewsDetector(objects, **options)

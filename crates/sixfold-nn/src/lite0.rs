@@ -165,6 +165,11 @@ pub fn imagenet_encoder(device: &Device) -> Result<Lite0, WeightsError> {
     Ok(load_weights_from_bytes(network, name, ENCODER, ENCODER_ARCHITECTURE)?.0)
 }
 
+/// The hash of the shipped ImageNet encoder, for the keys of files that hold its features.
+pub fn imagenet_encoder_hash() -> u64 {
+    sixfold_io::fnv1a(ENCODER)
+}
+
 impl Lite0Config {
     /// The network with random weights.
     pub fn init(&self, seed: u64, device: &Device) -> Lite0 {

@@ -12,6 +12,7 @@ use sixfold_estimator::{
 };
 use sixfold_io::Fnv1a;
 use sixfold_mesh::Mesh;
+use sixfold_nn::lite0::imagenet_encoder_hash;
 
 use crate::error::ViewsError;
 use crate::estimate::{Hypothesis, Views, ViewsOptions};
@@ -108,6 +109,7 @@ impl ViewsEstimator {
         let mut hash = Fnv1a::default();
         hash.write(&mesh.contents_hash().to_le_bytes());
         hash.write(&self.network.to_le_bytes());
+        hash.write(&imagenet_encoder_hash().to_le_bytes());
         // Numbers are printed with all their digits.
         hash.write(format!("{diameter:?} {:?}", self.templates).as_bytes());
         hash.value()

@@ -517,6 +517,22 @@ class Detector:
         masks: bool = True,
     ) -> list[DetectedObject]: ...
 
+class ViewsDetector:
+    def __init__(
+        self,
+        objects: Mapping[int, Mesh],
+        *,
+        poses: bool = True,
+        masks: bool = True,
+        threshold: float = 0.5,
+        overlap: float = 0.5,
+        per_object: int = 100,
+        max_detections: int = 100,
+    ) -> None: ...
+    @property
+    def object_ids(self) -> list[int]: ...
+    def __call__(self, rgb: ArrayLike) -> list[DetectedObject]: ...
+
 class Gripper:
     @staticmethod
     def load(path: Path) -> Gripper: ...

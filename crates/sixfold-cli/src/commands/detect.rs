@@ -3,7 +3,7 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::Mutex;
+use std::sync::{Mutex, PoisonError};
 use std::time::Instant;
 
 use anyhow::{Context, Result, anyhow, bail};
@@ -156,15 +156,27 @@ fn by_views(a: &DetectArguments, of_run: &mut RunOptions) -> Result<Chosen> {
         detector.check_object(*id).with_context(|| "--ids".to_string())?;
     }
     if let ([_], None) = (&a.rgb[..], &a.dataset) {
-        let progress = Mutex::new(Progress::new("objects", names.len()));
-        let named = names.clone();
-        detector.searched = Some(Box::new(move |id| {
-            if let Ok(mut progress) = progress.lock() {
-                progress.step(named.get(&id).cloned().unwrap_or_default());
-            }
-        }));
+        detector.searched = Some(shown(&names));
     }
     Ok(Chosen { detector: Box::new(detector), names, sure: own.threshold })
+}
+
+/// Shows the progress over the objects that are searched in one image; the bar disappears with the last one.
+fn shown(names: &BTreeMap<u32, String>) -> Box<dyn Fn(u32) + Send + Sync> {
+    let progress = Mutex::new(Some(Progress::new("objects", names.len())));
+    let names = names.clone();
+    let last = names.keys().next_back().copied();
+    Box::new(move |id| {
+        let mut progress = progress.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(progress) = progress.as_mut() {
+            progress.step(names.get(&id).cloned().unwrap_or_default());
+        }
+        if Some(id) == last
+            && let Some(progress) = progress.take()
+        {
+            progress.finish();
+        }
+    })
 }
 
 /// The options on which the detections of an image depend. The choice of images is not among them.
