@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 
 use anyhow::{Context, Result, bail};
 use sixfold_bop::{BopDataset, Models};
@@ -69,6 +69,24 @@ impl NumberedObjects {
     /// Their names.
     pub fn names(&self) -> BTreeMap<u32, String> {
         self.objects.iter().map(|(id, object)| (*id, object.name.clone())).collect()
+    }
+
+    /// Shows the progress over the objects that a detector searches in one image ([`ViewsDetector::searched`]); the bar disappears with the last one.
+    pub fn progress(&self) -> Box<dyn Fn(u32) + Send + Sync> {
+        let names = self.names();
+        let progress = Mutex::new(Some(Progress::new("objects", names.len())));
+        let last = names.keys().next_back().copied();
+        Box::new(move |id| {
+            let mut progress = progress.lock().unwrap_or_else(PoisonError::into_inner);
+            if let Some(progress) = progress.as_mut() {
+                progress.step(names.get(&id).cloned().unwrap_or_default());
+            }
+            if Some(id) == last
+                && let Some(progress) = progress.take()
+            {
+                progress.finish();
+            }
+        })
     }
 
     /// A detector of them by their views, which are rendered first unless they are kept in the cache.

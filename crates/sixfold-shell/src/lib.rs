@@ -11,6 +11,7 @@ pub mod board;
 pub mod datasets;
 pub mod demo;
 pub mod depth_views;
+pub mod detected;
 #[cfg(feature = "networks")]
 pub mod detectors;
 pub mod folder;

@@ -2,26 +2,22 @@
 //! dataset (resumable).
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
-use std::sync::{Mutex, PoisonError};
-use std::time::Instant;
+use std::path::Path;
 
 use anyhow::{Context, Result, anyhow, bail};
-use serde::Serialize;
-use sixfold_bop::{BopDataset, Detection, write_detections};
+use sixfold_bop::{BopDataset, Detection};
 use sixfold_detect::detect::DetectOptions;
 use sixfold_detect::detector::TrainedDetector;
 use sixfold_detect::torchvision::existing_objects_file;
 use sixfold_estimator::ObjectDetector;
-use sixfold_geometry::RgbImage;
-use sixfold_io::read_rgb;
-use sixfold_runner::{DetectionEvent, DetectionRun, FoundDetection, RunOptions, detections};
+use sixfold_runner::{DetectionEvent, DetectionRun, RunOptions};
 
 use sixfold_shell::Outcome;
+use sixfold_shell::detected::{ImageSearch, outcome};
 use sixfold_shell::detectors::NumberedObjects;
 use sixfold_shell::folder::OutputFolder;
 use sixfold_shell::frames::excepted;
-use sixfold_shell::output::{report, write_atomically};
+use sixfold_shell::output::report;
 use sixfold_shell::overlay::detections_over;
 use sixfold_shell::pictures::Pictures;
 use sixfold_shell::progress::{Progress, interrupted};
@@ -29,31 +25,6 @@ use sixfold_shell::ranges::without_duplicates;
 use sixfold_views::detector::ViewsDetectOptions;
 
 use super::detect_arguments::{DetectArguments, DetectMethod};
-
-#[derive(Serialize)]
-struct Many {
-    images: Vec<OneOfMany>,
-    detections: usize,
-    detections_per_image: Option<f64>,
-    skipped: Vec<String>,
-}
-
-#[derive(Serialize)]
-struct OneOfMany {
-    /// Its index, from 1.
-    image: u32,
-    file: PathBuf,
-    detections: Vec<FoundDetection>,
-    seconds: f64,
-}
-
-#[derive(Serialize)]
-struct Whole {
-    detections: Vec<FoundDetection>,
-    seconds: f64,
-    file: Option<PathBuf>,
-    overlay: Option<PathBuf>,
-}
 
 /// A detector with what is said about its objects.
 struct Chosen {
@@ -74,9 +45,21 @@ pub(crate) fn run(a: &DetectArguments) -> Result<Outcome> {
     };
     match (&a.dataset, &a.rgb[..]) {
         (Some(root), _) => in_dataset(a, &chosen, root, &of_run),
-        (None, [file]) => in_image(a, &chosen, file),
         (None, []) => bail!("give --rgb FILE or --dataset DIR"),
-        (None, files) => in_images(a, &chosen, files),
+        (None, files) => {
+            let detector = chosen.detector.as_ref();
+            let search = ImageSearch {
+                detector,
+                names: &chosen.names,
+                ids: &a.ids,
+                out: a.out.as_deref(),
+                json: &a.json,
+            };
+            match files {
+                [file] => search.one(file),
+                files => search.many(files),
+            }
+        }
     }
 }
 
@@ -156,27 +139,9 @@ fn by_views(a: &DetectArguments, of_run: &mut RunOptions) -> Result<Chosen> {
         detector.check_object(*id).with_context(|| "--ids".to_string())?;
     }
     if let ([_], None) = (&a.rgb[..], &a.dataset) {
-        detector.searched = Some(shown(&names));
+        detector.searched = Some(objects.progress());
     }
     Ok(Chosen { detector: Box::new(detector), names, sure: own.threshold })
-}
-
-/// Shows the progress over the objects that are searched in one image; the bar disappears with the last one.
-fn shown(names: &BTreeMap<u32, String>) -> Box<dyn Fn(u32) + Send + Sync> {
-    let progress = Mutex::new(Some(Progress::new("objects", names.len())));
-    let names = names.clone();
-    let last = names.keys().next_back().copied();
-    Box::new(move |id| {
-        let mut progress = progress.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(progress) = progress.as_mut() {
-            progress.step(names.get(&id).cloned().unwrap_or_default());
-        }
-        if Some(id) == last
-            && let Some(progress) = progress.take()
-        {
-            progress.finish();
-        }
-    })
 }
 
 /// The options on which the detections of an image depend. The choice of images is not among them.
@@ -224,113 +189,6 @@ fn run_options(a: &DetectArguments) -> RunOptions {
     options.add("scales", &format!("{scales:?}"));
     options.add("no-masks", &no_masks.to_string());
     options
-}
-
-/// The outcome for a number of detections.
-fn outcome(detections: usize, skipped: &[String]) -> Outcome {
-    match (skipped.is_empty(), detections) {
-        (false, _) => Outcome::Incomplete,
-        (true, 0) => Outcome::NothingFound,
-        (true, _) => Outcome::Found,
-    }
-}
-
-/// Reads and searches an image; returns it, its detections under the number `image`, and the seconds it took.
-fn detect_file(
-    a: &DetectArguments,
-    detector: &dyn ObjectDetector,
-    file: &Path,
-    image: u32,
-) -> Result<(RgbImage, Vec<Detection>, f64)> {
-    let rgb = read_rgb(file)?;
-    let start = Instant::now();
-    let found = detections(detector, &rgb, &a.ids, (0, image)).with_context(|| file.display().to_string())?;
-    Ok((rgb, found, start.elapsed().as_secs_f64()))
-}
-
-fn in_image(a: &DetectArguments, chosen: &Chosen, file: &Path) -> Result<Outcome> {
-    let mut folder = a.out.as_deref().map(OutputFolder::take).transpose()?;
-    let names = ["detections.json", "overlay.png", "result.json"];
-    let paths = folder.as_mut().map(|f| f.files(&names)).transpose()?;
-    let (image, found, seconds) = detect_file(a, chosen.detector.as_ref(), file, 0)?;
-    let whole = Whole {
-        detections: found.iter().filter_map(|d| FoundDetection::new(d, &chosen.names)).collect(),
-        seconds,
-        file: paths.as_ref().map(|p| p[0].clone()),
-        overlay: paths.as_ref().map(|p| p[1].clone()),
-    };
-    if let Some(paths) = &paths {
-        write_detections(&paths[0], &found)?;
-        write_atomically(&paths[2], serde_json::to_string_pretty(&whole)?.as_bytes())?;
-    }
-    report(&a.json, &whole, || {
-        println!("{:>8} {:>8} {:>32} {:>10}", "object", "score", "box: x, y, width, height", "mask");
-        for d in &whole.detections {
-            let numbers: Vec<String> = d.bbox.iter().map(|v| format!("{v:.1}")).collect();
-            let mask = d.mask_pixels.map_or("-".to_string(), |m| format!("{m} px"));
-            let object = d.object.clone().unwrap_or_else(|| d.object_id.to_string());
-            println!("{object:>8} {:>8.3} {:>32} {mask:>10}", d.score, numbers.join(", "));
-        }
-        if whole.detections.is_empty() {
-            println!("nothing found");
-        }
-        println!("{:.0} ms", 1000.0 * whole.seconds);
-        if let Some(folder) = &a.out {
-            println!("detections.json and overlay.png are in {}", folder.display());
-        }
-    })?;
-    let mut pictures = Pictures::of(folder);
-    if whole.overlay.is_some() {
-        pictures.write("overlay.png", &detections_over(&image, &found, &chosen.names));
-    }
-    Ok(pictures.outcome(outcome(whole.detections.len(), &[])))
-}
-
-/// Several images outside datasets; in `detections.json` their ids are their indices, from 1.
-fn in_images(a: &DetectArguments, chosen: &Chosen, files: &[PathBuf]) -> Result<Outcome> {
-    let mut folder = a.out.as_deref().map(OutputFolder::take).transpose()?;
-    let file = folder.as_mut().map(|f| f.file("detections.json")).transpose()?;
-    let mut pictures = Pictures::of(folder);
-    let mut progress = Progress::new("images", files.len());
-    let (mut images, mut all, mut skipped) = (vec![], vec![], vec![]);
-    for (number, file) in (1..).zip(files) {
-        match detect_file(a, chosen.detector.as_ref(), file, number) {
-            Ok((image, found, seconds)) => {
-                if a.out.is_some() {
-                    let stem = file.file_stem().unwrap_or_default().to_string_lossy();
-                    let name = format!("overlays/{number:06}_{stem}.png");
-                    pictures.write(&name, &detections_over(&image, &found, &chosen.names));
-                }
-                let detections = found.iter().filter_map(|d| FoundDetection::new(d, &chosen.names)).collect();
-                images.push(OneOfMany { image: number, file: file.clone(), detections, seconds });
-                all.extend(found);
-            }
-            Err(error) => skipped.push(format!("{}: {}", file.display(), sixfold_shell::describe(&error))),
-        }
-        progress.step(file.display().to_string());
-    }
-    progress.finish();
-    skipped.append(&mut pictures.take_failed());
-    for s in &skipped {
-        eprintln!("skipped {s}");
-    }
-    if let Some(file) = &file {
-        write_detections(file, &all)?;
-    }
-    let per_image = (!images.is_empty()).then(|| all.len() as f64 / images.len() as f64);
-    let many = Many { images, detections: all.len(), detections_per_image: per_image, skipped };
-    report(&a.json, &many, || {
-        println!("{:>8} {:>8} {:>10}  file", "image", "objects", "best score");
-        for i in &many.images {
-            let best = i.detections.first().map_or("-".to_string(), |d| format!("{:.3}", d.score));
-            println!("{:>8} {:>8} {best:>10}  {}", i.image, i.detections.len(), i.file.display());
-        }
-        println!("{} detections in {} images", many.detections, many.images.len());
-        if let Some(folder) = &a.out {
-            println!("detections.json and overlays are in {}", folder.display());
-        }
-    })?;
-    Ok(outcome(many.detections, &many.skipped))
 }
 
 fn in_dataset(a: &DetectArguments, chosen: &Chosen, root: &Path, options: &RunOptions) -> Result<Outcome> {

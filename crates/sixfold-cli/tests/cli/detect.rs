@@ -319,3 +319,69 @@ fn detectors_with_anchors_are_trained_on_lite0() {
         &["--backbone", "resnet50 with network compact"],
     );
 }
+
+#[test]
+fn objects_are_detected_by_their_views() {
+    let tiny = Tiny::coloured();
+    let views = |rest: &str| format!("detect --method views {rest} --cache kept");
+    // The whole dataset: its models are the objects.
+    let all = views("--dataset tiny --out found.json --overlays pictures --json");
+    let run = sixfold(tiny.path(), &all).expect(0).json();
+    assert_eq!(run["images"], 3);
+    let scores = sixfold(tiny.path(), "eval --dataset tiny --detections found.json --json").expect(0).json();
+    for kind in ["box", "mask"] {
+        assert!(scores[kind]["ap50"].as_f64().unwrap() > 0.5, "{kind}: {scores}");
+    }
+    assert!(image::open(tiny.path().join("pictures/000007_000004.png")).is_ok());
+
+    // One image without its camera: the object has a name, and the table shows it.
+    let one =
+        "--object tiny/models/obj_000001.ply --unit mm --rgb tiny/test/000007/rgb/000004.png --threshold 0";
+    let run = sixfold(tiny.path(), &views(&format!("{one} --out one --json"))).expect(0);
+    assert!(!run.stderr.contains("rendered again"), "{}", run.stderr);
+    let found = &run.json()["detections"][0];
+    assert_eq!((&found["object_id"], &found["object"]), (&1.into(), &"obj_000001".into()));
+    assert!(found["mask_pixels"].as_u64().unwrap() > 0);
+    assert!(image::open(tiny.path().join("one/overlay.png")).is_ok());
+    let quick =
+        sixfold(tiny.path(), &views(&format!("{one} --quick --no-masks --max-detections 2"))).expect(0);
+    assert_eq!(quick.stdout.matches("obj_000001").count(), 2, "{}", quick.stdout);
+    // No detection has this score.
+    sixfold(tiny.path(), &views(&format!("{} --quick", one.replace("threshold 0", "threshold 1")))).expect(1);
+
+    // A changed model is another run.
+    let model = tiny.file("models/obj_000001.ply");
+    let image = tiny.file("test/000007/rgb/000004.png");
+    let before = std::fs::read(&image).unwrap();
+    std::fs::write(&image, b"no image").unwrap();
+    let part = views("--quick --dataset tiny --ids 1 --out part.json");
+    sixfold(tiny.path(), &part).expect(2);
+    std::fs::write(&image, before).unwrap();
+    let text = std::fs::read(&model).unwrap();
+    std::fs::write(&model, [b"ply\ncomment changed".as_slice(), &text[3..]].concat()).unwrap();
+    fails(tiny.path(), &part, &["part.json.part", "object 1", "remove both"]);
+}
+
+#[test]
+fn detection_by_views_says_what_is_missing() {
+    let tiny = Tiny::coloured();
+    let rgb = "--rgb tiny/test/000007/rgb/000004.png";
+    let cases: [(&str, &[&str]); 7] = [
+        ("detect --method views", &["--method views needs --object"]),
+        ("detect --method views --weights a.safetensors", &["--weights is no option of --method views"]),
+        ("detect --method views --scales 2", &["--scales is no option of --method views"]),
+        ("detect --quick", &["--quick is no option of --method network"]),
+        ("detect --object tiny/models/obj_000001.ply", &["--object is no option of --method network"]),
+        ("detect --method views --object tiny/models/obj_000001.ply", &["--unit"]),
+        ("detect --method views --object nowhere.ply --unit mm", &["nowhere.ply"]),
+    ];
+    for (command, words) in cases {
+        fails(tiny.path(), &format!("{command} {rgb}"), words);
+    }
+    fails(tiny.path(), "detect --method views --dataset tiny --ids 9 --out f.json", &["object 9"]);
+    std::fs::remove_file(tiny.file("models/models_info.json")).unwrap();
+    let words = ["models_info.json", "--ids"];
+    fails(tiny.path(), "detect --method views --dataset tiny --out f.json", &words);
+    let message = "detect --method views --object tiny/models/obj_000001.ply --unit mm --threshold 2";
+    fails(tiny.path(), &format!("{message} {rgb}"), &["threshold", "found 2"]);
+}
