@@ -376,6 +376,49 @@ mod tests {
         assert_eq!((shown, count), (vec![2, 5], 2));
     }
 
+    /// An object in front of the camera as a detection.
+    fn posed<'a>(
+        camera: &Camera,
+        object: &'a dyn PreparedObject,
+        id: u32,
+        at: [f64; 3],
+    ) -> Candidate<Shown<'a>> {
+        let object: &ViewsObject = downcast(object, "views").unwrap();
+        let pose = Pose::from_translation(at.into());
+        let bbox = projected_box(&object.outline, camera, &pose).unwrap();
+        let shown = Shown::Posed(object, pose);
+        Candidate { id, agreement: 1.0, strength: 1.0, curve: OF_POSES, bbox, shown }
+    }
+
+    #[test]
+    fn what_surer_detections_elsewhere_hide_is_left_out() {
+        let camera = Camera::new(570.0, 570.0, 319.5, 239.5, 640, 480).unwrap();
+        let mut estimator = ViewsEstimator::shipped().unwrap();
+        estimator.templates = TemplateOptions { directions: 4, rotations: 1, ..TemplateOptions::default() };
+        let prepared = |mesh: Mesh| {
+            let info = ModelInfo::of_mesh(&mesh);
+            estimator.prepare(&Object::of_mesh("an object", mesh, info)).unwrap()
+        };
+        let [cube, plate] = [[0.05; 3], [0.15, 0.15, 0.002]]
+            .map(|half| prepared(cuboid(half.map(|v: f64| -v), half, [90; 3])));
+        let options = ViewsDetectOptions::default();
+        let width = |found: &[DetectedObject]| {
+            found.iter().map(|d| (d.object_id, d.region.bbox.width.round())).collect::<Vec<_>>()
+        };
+        let own = |z: f64| posed(&camera, cube.as_ref(), 1, [0.0, 0.0, z]);
+        let beside = |x: f64| posed(&camera, plate.as_ref(), 2, [x, 0.0, 0.7]);
+        let whole = width(&regions(vec![own(1.0)], &camera, &options))[0].1;
+        // The plate hides the right half of the cube behind it; all but 12 %, all but 3 %, all.
+        let half = width(&regions(vec![beside(0.15), own(1.0)], &camera, &options));
+        assert!(half[1].0 == 1 && (0.4..0.6).contains(&(half[1].1 / whole)), "{half:?} of {whole}");
+        let number = |x: f64| regions(vec![beside(x), own(1.0)], &camera, &options).len();
+        assert_eq!([0.122, 0.115, 0.1].map(number), [2, 1, 1]);
+        // A less certain one hides nothing, nor does one behind.
+        assert_eq!(width(&regions(vec![own(1.0), beside(0.15)], &camera, &options))[0].1, whole);
+        let before = width(&regions(vec![own(0.5)], &camera, &options))[0].1;
+        assert_eq!(width(&regions(vec![beside(0.15), own(0.5)], &camera, &options))[1].1, before);
+    }
+
     /// Proposes these boxes.
     struct Boxes(Vec<Rect>);
 

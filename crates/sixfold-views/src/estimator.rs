@@ -148,7 +148,7 @@ pub struct ViewsObject {
     name: String,
     mesh: Arc<Mesh>,
     pub(crate) view: Mesh,
-    outline: Mesh,
+    pub(crate) outline: Mesh,
     templates: Vec<Template>,
     printed: Printed,
     notes: Vec<String>,
