@@ -66,9 +66,14 @@ impl NumberedObjects {
         Ok(NumberedObjects { objects, files: BTreeMap::new() })
     }
 
-    /// Their names.
+    /// Their names; those that several objects have, with the number behind.
     pub fn names(&self) -> BTreeMap<u32, String> {
-        self.objects.iter().map(|(id, object)| (*id, object.name.clone())).collect()
+        let shared = |name: &String| self.objects.values().filter(|object| object.name == *name).count() > 1;
+        let name = |(id, object): (&u32, &Object)| {
+            let name = &object.name;
+            (*id, if shared(name) { format!("{name} {id}") } else { name.clone() })
+        };
+        self.objects.iter().map(name).collect()
     }
 
     /// Shows the progress over the objects that a detector searches in one image ([`ViewsDetector::searched`]); the bar disappears with the last one.
@@ -110,5 +115,18 @@ impl NumberedObjects {
         let mut detector = ViewsDetector::new(estimator, Arc::new(proposals), prepared);
         detector.options = options;
         Ok(detector)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn objects_of_one_name_are_told_apart() {
+        let object = |name: &str| Object { name: name.to_owned(), ..Object::of_model(None) };
+        let objects = BTreeMap::from([(1, object("mesh")), (2, object("mug")), (3, object("mesh"))]);
+        let names = NumberedObjects { objects, files: BTreeMap::new() }.names();
+        assert_eq!(names.into_values().collect::<Vec<_>>(), ["mesh 1", "mug", "mesh 3"]);
     }
 }

@@ -5,7 +5,8 @@
 //! Objects compete for the parts of the image: a detection's agreement `a` (that of `search`) is reduced to `a a^2 / (a^2 + o^2)`, where `o` is
 //! that of the other object which agrees most with the same part (ours). A logistic function of its logarithm gives the score.
 //!
-//! The image's camera is not known. Poses are estimated for one with a usual field of view; boxes and masks hardly depend on it.
+//! The image's camera is not known. Poses are estimated for one with a usual field of view, and
+//! may be wrong in distance; what is kept of them, boxes and masks, depends less on it.
 
 use std::collections::BTreeMap;
 use std::sync::Arc;

@@ -10,8 +10,8 @@ use sixfold_detect::detect::DetectOptions;
 use sixfold_detect::detector::TrainedDetector;
 use sixfold_detect::torchvision::existing_objects_file;
 use sixfold_estimator::ObjectDetector;
+use sixfold_io::read_rgb;
 use sixfold_runner::{DetectionEvent, DetectionRun, RunOptions};
-
 use sixfold_shell::Outcome;
 use sixfold_shell::detected::{ImageSearch, outcome};
 use sixfold_shell::detectors::NumberedObjects;
@@ -114,6 +114,10 @@ fn by_views(a: &DetectArguments, of_run: &mut RunOptions) -> Result<Chosen> {
         masks: !a.no_masks,
     };
     options.check()?;
+    // Rendering takes time, so a file that is not there is reported before.
+    if let [file] = &a.rgb[..] {
+        read_rgb(file)?;
+    }
     let cache = a.cache.cache();
     let (objects, names) = match &a.dataset {
         Some(root) => {

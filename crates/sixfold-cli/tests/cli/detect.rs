@@ -375,6 +375,8 @@ fn detection_by_views_says_what_is_missing() {
         ("detect --method views --object tiny/models/obj_000001.ply", &["--unit"]),
         ("detect --method views --object nowhere.ply --unit mm", &["nowhere.ply"]),
     ];
+    let missing = "detect --method views --object nowhere.ply --unit mm --rgb missing.png";
+    fails(tiny.path(), missing, &["missing.png"]);
     for (command, words) in cases {
         fails(tiny.path(), &format!("{command} {rgb}"), words);
     }
