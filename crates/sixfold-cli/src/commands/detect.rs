@@ -135,13 +135,13 @@ fn by_views(a: &DetectArguments, of_run: &mut RunOptions) -> Result<Chosen> {
         None => {
             let objects = NumberedObjects::of_names(&a.objects, a.unit, &a.store.store(), &cache)?;
             let names = objects.names();
+            if let Some(id) = a.ids.iter().find(|id| !names.contains_key(id)) {
+                bail!("--ids: found {id}, expected 1 to {}, the numbers of --object", names.len());
+            }
             (objects, names)
         }
     };
     let mut detector = objects.detector(options)?;
-    for id in &a.ids {
-        detector.check_object(*id).with_context(|| "--ids".to_string())?;
-    }
     if let ([_], None) = (&a.rgb[..], &a.dataset) {
         detector.searched = Some(objects.progress());
     }
