@@ -215,8 +215,7 @@ impl PyViewsDetector {
         let estimator = estimator.map_err(|error| file_or_value(&error))?;
         let proposals = interruptible(py, |_| TrainedDetector::proposals())?;
         let proposals = proposals.map_err(|error| file_or_value(&error))?;
-        let own = DetectOptions { masks: masks && !poses, ..*proposals.options() };
-        let proposals = Arc::new(proposals.with_options(own));
+        let proposals = Arc::new(proposals.with_masks(masks && !poses));
         let detector = interruptible(py, move |stop| -> Result<_, EstimatorError> {
             let mut prepared = BTreeMap::new();
             for (id, (mesh, info)) in meshes {

@@ -76,6 +76,12 @@ impl TrainedDetector {
         TrainedDetector { options, ..self }
     }
 
+    /// The same detector, with or without masks.
+    #[must_use]
+    pub fn with_masks(self, masks: bool) -> TrainedDetector {
+        TrainedDetector { options: DetectOptions { masks, ..self.options }, ..self }
+    }
+
     /// The network.
     pub fn model(&self) -> &DetectorModel {
         &self.model

@@ -1,12 +1,10 @@
 //! Detection of objects by their views: the objects that a command names, and the detector of them.
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use anyhow::{Context, Result, bail};
 use sixfold_bop::{BopDataset, Models};
-use sixfold_detect::detect::DetectOptions;
 use sixfold_detect::detector::TrainedDetector;
 use sixfold_estimator::{Cache, Object, ObjectStore, PoseEstimator};
 use sixfold_mesh::Unit;
@@ -17,32 +15,32 @@ use sixfold_views::estimator::ViewsEstimator;
 use crate::progress::Progress;
 
 /// Objects by the numbers under which they are reported.
-pub struct NumberedObjects {
-    objects: BTreeMap<u32, Object>,
-    /// The files of their meshes, if they are of a dataset.
-    pub files: BTreeMap<u32, PathBuf>,
-}
+pub struct NumberedObjects(BTreeMap<u32, Object>);
 
 impl NumberedObjects {
-    /// The objects of a dataset: all that its `models_info.json` lists, or those of `ids`.
+    /// The ids of a dataset's objects: all that its `models_info.json` lists, or `wanted`.
     ///
     /// # Errors
-    /// When a model is missing or broken, or the dataset has no `models_info.json` and `ids` is empty.
-    pub fn of_dataset(dataset: &BopDataset, ids: &[u32], cache: &Cache) -> Result<NumberedObjects> {
-        let infos = dataset.models_info(Models::Rendering)?;
-        let all = infos.as_ref().map(|infos| infos.0.keys().copied().collect::<Vec<u32>>());
-        let ids = match (ids, all) {
+    /// When the dataset has no `models_info.json` and `wanted` is empty.
+    pub fn ids_in(dataset: &BopDataset, wanted: &[u32]) -> Result<Vec<u32>> {
+        match (wanted, dataset.models_info(Models::Rendering)?) {
             ([], None) => bail!(
                 "{}: expected models/models_info.json, which lists the objects to detect; found none: name some with --ids",
                 dataset.root().display()
             ),
-            ([], Some(all)) => all,
-            (ids, _) => ids.to_vec(),
-        };
+            ([], Some(infos)) => Ok(infos.0.keys().copied().collect()),
+            (wanted, _) => Ok(wanted.to_vec()),
+        }
+    }
+
+    /// These objects of a dataset.
+    ///
+    /// # Errors
+    /// When a model is missing or broken.
+    pub fn of_dataset(dataset: &BopDataset, ids: &[u32], cache: &Cache) -> Result<NumberedObjects> {
+        let infos = dataset.models_info(Models::Rendering)?;
         let object = |id: &u32| Ok((*id, dataset_object(dataset, *id, infos.as_ref(), cache)?));
-        let objects = ids.iter().map(object).collect::<Result<_>>()?;
-        let files = ids.iter().map(|id| (*id, dataset.model_path(*id, Models::Rendering))).collect();
-        Ok(NumberedObjects { objects, files })
+        Ok(NumberedObjects(ids.iter().map(object).collect::<Result<_>>()?))
     }
 
     /// Mesh files and stored objects, numbered from 1 in the order of their names.
@@ -63,17 +61,17 @@ impl NumberedObjects {
             }
             objects.insert(id, object);
         }
-        Ok(NumberedObjects { objects, files: BTreeMap::new() })
+        Ok(NumberedObjects(objects))
     }
 
     /// Their names; those that several objects have, with the number behind.
     pub fn names(&self) -> BTreeMap<u32, String> {
-        let shared = |name: &String| self.objects.values().filter(|object| object.name == *name).count() > 1;
+        let shared = |name: &String| self.0.values().filter(|object| object.name == *name).count() > 1;
         let name = |(id, object): (&u32, &Object)| {
             let name = &object.name;
             (*id, if shared(name) { format!("{name} {id}") } else { name.clone() })
         };
-        self.objects.iter().map(name).collect()
+        self.0.iter().map(name).collect()
     }
 
     /// Shows the progress over the objects that a detector searches in one image ([`ViewsDetector::searched`]); the bar disappears with the last one.
@@ -101,11 +99,10 @@ impl NumberedObjects {
     pub fn detector(&self, options: ViewsDetectOptions) -> Result<ViewsDetector> {
         let estimator = ViewsEstimator::shipped().context("the network within the program")?;
         let proposals = TrainedDetector::proposals().context("the detector within the program")?;
-        let of_proposals = DetectOptions { masks: options.masks && !options.poses, ..*proposals.options() };
-        let proposals = proposals.with_options(of_proposals);
-        let mut progress = Progress::new("objects rendered", self.objects.len());
+        let proposals = proposals.with_masks(options.masks && !options.poses);
+        let mut progress = Progress::new("objects rendered", self.0.len());
         let mut prepared = BTreeMap::new();
-        for (id, object) in &self.objects {
+        for (id, object) in &self.0 {
             let one = estimator.prepare(object)?;
             one.notes().iter().for_each(|note| eprintln!("note: {note}"));
             prepared.insert(*id, one);
@@ -126,7 +123,7 @@ mod tests {
     fn objects_of_one_name_are_told_apart() {
         let object = |name: &str| Object { name: name.to_owned(), ..Object::of_model(None) };
         let objects = BTreeMap::from([(1, object("mesh")), (2, object("mug")), (3, object("mesh"))]);
-        let names = NumberedObjects { objects, files: BTreeMap::new() }.names();
+        let names = NumberedObjects(objects).names();
         assert_eq!(names.into_values().collect::<Vec<_>>(), ["mesh 1", "mug", "mesh 3"]);
     }
 }

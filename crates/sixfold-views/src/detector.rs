@@ -83,7 +83,7 @@ pub struct ViewsDetector {
 /// A detection before boxes are suppressed.
 struct Candidate<S> {
     id: u32,
-    /// How well the image agrees with it; after [`compete`] less what it shares with other objects.
+    /// How well the image agrees with it; after [`compete`] reduced by that of other objects there.
     agreement: f64,
     /// With what it competes.
     strength: f64,
@@ -211,15 +211,15 @@ impl ObjectDetector for ViewsDetector {
     }
 }
 
-/// Reduces the agreement of each candidate by its share of the best other object in about the same box.
+/// Reduces the agreement of each candidate the more, the better another object agrees with about the same box.
 fn compete<S: Sync>(candidates: &mut [Candidate<S>], overlap: f64) {
-    let share = |of: &Candidate<S>| {
+    let factor = |of: &Candidate<S>| {
         let rival = |c: &&Candidate<S>| c.id != of.id && c.bbox.iou(&of.bbox) > overlap;
         let other = candidates.iter().filter(rival).map(|c| c.strength).fold(0.0, f64::max);
         if of.strength > 0.0 { 1.0 / (1.0 + (other / of.strength).powi(2)) } else { 0.0 }
     };
-    let shares: Vec<f64> = candidates.par_iter().map(share).collect();
-    candidates.iter_mut().zip(shares).for_each(|(c, share)| c.agreement *= share);
+    let factors: Vec<f64> = candidates.par_iter().map(factor).collect();
+    candidates.iter_mut().zip(factors).for_each(|(c, factor)| c.agreement *= factor);
 }
 
 /// The candidates by decreasing score without those below the threshold, those that overlap a better one of their object, and those beyond the
@@ -330,7 +330,7 @@ mod tests {
     }
 
     #[test]
-    fn another_object_at_the_same_place_takes_its_share() {
+    fn another_object_at_the_same_place_reduces_the_agreement() {
         // 3 and 4 pixels apart the intersections over union are 0.538 and 0.429.
         let mut all = [
             candidate(1, 0.4, 0.0),

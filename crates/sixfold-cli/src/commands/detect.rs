@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use anyhow::{Context, Result, anyhow, bail};
-use sixfold_bop::{BopDataset, Detection};
+use sixfold_bop::{BopDataset, Detection, Models};
 use sixfold_detect::detect::DetectOptions;
 use sixfold_detect::detector::TrainedDetector;
 use sixfold_detect::torchvision::existing_objects_file;
@@ -39,12 +39,13 @@ pub(crate) fn run(a: &DetectArguments) -> Result<Outcome> {
     without_duplicates("--ids", &a.ids)?;
     // The weights are hashed before they are read, so that a change in between is noticed.
     let mut of_run = run_options(a);
+    let dataset = a.dataset.as_deref().map(|root| opened(a, root)).transpose()?;
     let chosen = match a.method {
         DetectMethod::Network => by_network(a)?,
-        DetectMethod::Views => by_views(a, &mut of_run)?,
+        DetectMethod::Views => by_views(a, dataset.as_ref().map(|(dataset, _)| dataset), &mut of_run)?,
     };
-    match (&a.dataset, &a.rgb[..]) {
-        (Some(root), _) => in_dataset(a, &chosen, root, &of_run),
+    match (&dataset, &a.rgb[..]) {
+        (Some((dataset, out)), _) => in_dataset(a, &chosen, (dataset, out), &of_run),
         (None, []) => bail!("give --rgb FILE or --dataset DIR"),
         (None, files) => {
             let detector = chosen.detector.as_ref();
@@ -61,6 +62,15 @@ pub(crate) fn run(a: &DetectArguments) -> Result<Outcome> {
             }
         }
     }
+}
+
+/// The dataset and the file for its detections, both checked before anything is computed.
+fn opened<'a>(a: &'a DetectArguments, root: &Path) -> Result<(BopDataset, &'a Path)> {
+    let out = a.out.as_deref().ok_or_else(|| anyhow!("--out FILE.json is missing"))?;
+    if out.extension().is_none_or(|e| e != "json") {
+        bail!("--out: found {}, expected a file that ends in .json", out.display());
+    }
+    Ok((BopDataset::open(root, &a.split)?, out))
 }
 
 /// A trained detector, or that of any object.
@@ -98,7 +108,7 @@ fn by_network(a: &DetectArguments) -> Result<Chosen> {
 }
 
 /// The detector of objects by their views.
-fn by_views(a: &DetectArguments, of_run: &mut RunOptions) -> Result<Chosen> {
+fn by_views(a: &DetectArguments, dataset: Option<&BopDataset>, of_run: &mut RunOptions) -> Result<Chosen> {
     for (option, given) in [("--weights", a.weights.is_some()), ("--scales", a.scales.is_some())] {
         if given {
             bail!("{option} is no option of --method views, but of --method network");
@@ -106,7 +116,7 @@ fn by_views(a: &DetectArguments, of_run: &mut RunOptions) -> Result<Chosen> {
     }
     let own = ViewsDetectOptions::default();
     let options = ViewsDetectOptions {
-        threshold: a.threshold.map_or(if a.dataset.is_some() { 0.0 } else { own.threshold }, f64::from),
+        threshold: a.threshold.map_or(if dataset.is_some() { 0.0 } else { own.threshold }, f64::from),
         overlap: a.overlap.map_or(own.overlap, f64::from),
         per_object: a.per_object.unwrap_or(own.per_object),
         max_detections: a.max_detections.unwrap_or(own.max_detections),
@@ -119,15 +129,15 @@ fn by_views(a: &DetectArguments, of_run: &mut RunOptions) -> Result<Chosen> {
         read_rgb(file)?;
     }
     let cache = a.cache.cache();
-    let (objects, names) = match &a.dataset {
-        Some(root) => {
-            let objects = NumberedObjects::of_dataset(&BopDataset::open(root, &a.split)?, &a.ids, &cache)?;
-            // The models decide about the detections, so a run resumes only with the same ones.
-            objects
-                .files
-                .iter()
-                .for_each(|(id, file)| of_run.add(&format!("object {id}"), &file.to_string_lossy()));
-            (objects, BTreeMap::new())
+    let (objects, names) = match dataset {
+        Some(dataset) => {
+            let ids = NumberedObjects::ids_in(dataset, &a.ids)?;
+            // A run resumes only with the same models; they are hashed before they are read, as weights are.
+            for id in &ids {
+                let file = dataset.model_path(*id, Models::Rendering);
+                of_run.add(&format!("object {id}"), &file.to_string_lossy());
+            }
+            (NumberedObjects::of_dataset(dataset, &ids, &cache)?, BTreeMap::new())
         }
         None if a.objects.is_empty() => {
             bail!("--method views needs --object NAME_OR_MESH ...: what is to be detected?")
@@ -142,7 +152,7 @@ fn by_views(a: &DetectArguments, of_run: &mut RunOptions) -> Result<Chosen> {
         }
     };
     let mut detector = objects.detector(options)?;
-    if let ([_], None) = (&a.rgb[..], &a.dataset) {
+    if let ([_], None) = (&a.rgb[..], dataset) {
         detector.searched = Some(objects.progress());
     }
     Ok(Chosen { detector: Box::new(detector), names, sure: own.threshold })
@@ -195,22 +205,22 @@ fn run_options(a: &DetectArguments) -> RunOptions {
     options
 }
 
-fn in_dataset(a: &DetectArguments, chosen: &Chosen, root: &Path, options: &RunOptions) -> Result<Outcome> {
-    let out = a.out.as_deref().ok_or_else(|| anyhow!("--out FILE.json is missing"))?;
-    if out.extension().is_none_or(|e| e != "json") {
-        bail!("--out: found {}, expected a file that ends in .json", out.display());
-    }
-    let dataset = BopDataset::open(root, &a.split)?;
+fn in_dataset(
+    a: &DetectArguments,
+    chosen: &Chosen,
+    (dataset, out): (&BopDataset, &Path),
+    options: &RunOptions,
+) -> Result<Outcome> {
     // The images of the targets, or all images of a dataset without targets, except those of `--except`.
     let mut images = dataset.images(a.targets.as_deref().or(dataset.targets_file().as_deref()))?;
-    for image in excepted(&dataset, a.except.as_deref())? {
+    for image in excepted(dataset, a.except.as_deref())? {
         images.remove(&image);
     }
     let images: Vec<(u32, u32)> = images.into_iter().collect();
     let mut progress = Progress::new("images", images.len());
     let mut pictures = Pictures::of(a.overlays.as_deref().map(OutputFolder::take).transpose()?);
     let detector = chosen.detector.as_ref();
-    let run = DetectionRun { detector, dataset: &dataset, images: &images, ids: &a.ids, options };
+    let run = DetectionRun { detector, dataset, images: &images, ids: &a.ids, options };
     let summary = run.run(out, interrupted(), &mut |event| match event {
         DetectionEvent::Image { image, earlier: true } => progress.step(format!("{image} was done")),
         DetectionEvent::Image { image, earlier: false } => progress.step(image),

@@ -383,6 +383,8 @@ fn detection_by_views_says_what_is_missing() {
     let other = format!("detect --method views --object tiny/models/obj_000001.ply --unit mm --ids 2 {rgb}");
     fails(tiny.path(), &other, &["--ids", "found 2"]);
     fails(tiny.path(), "detect --method views --dataset tiny --ids 9 --out f.json", &["object 9"]);
+    // Before anything is rendered, which would fail for object 9.
+    fails(tiny.path(), "detect --method views --dataset tiny --ids 9 --out f.csv", &["f.csv", ".json"]);
     std::fs::remove_file(tiny.file("models/models_info.json")).unwrap();
     let words = ["models_info.json", "--ids"];
     fails(tiny.path(), "detect --method views --dataset tiny --out f.json", &words);
