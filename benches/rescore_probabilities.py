@@ -23,6 +23,11 @@ def log_odds(model, numbers):
     return model["scaling"][0] * raw + model["scaling"][1]
 
 
+def model_for(calibration, given, numbers):
+    searched = all(numbers[calibration["names"].index(name)] is not None for name in ("recognised", "support"))
+    return calibration["color_without_search" if given == "color" and not searched else given]
+
+
 def error(probabilities, right):
     bins = np.minimum((probabilities * 10).astype(int), 9)
     off = [abs((probabilities - right)[bins == b].sum()) for b in range(10)]
@@ -40,7 +45,8 @@ def main():
         poses = [s["poses"] for s in searches if s["given"] == given and s["poses"]]
         if not poses:
             continue
-        best = [max((log_odds(calibration[given], p["numbers"]), p["right"]) for p in of) for of in poses]
+        odds = [[log_odds(model_for(calibration, given, p["numbers"]), p["numbers"]) for p in of] for of in poses]
+        best = [max(zip(odds_of, (p["right"] for p in of))) for odds_of, of in zip(odds, poses)]
         probabilities = 1 / (1 + np.exp([-z for z, _ in best]))
         right = np.array([r for _, r in best])
         random = np.random.default_rng(0)

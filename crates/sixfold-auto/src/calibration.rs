@@ -1,15 +1,15 @@
-//! The fitted models, one for each combination of images (depth, colour, both), and their file.
+//! The fitted models, one for each combination of images (depth, colour, both), and for colour one more without the numbers of a search; and their file.
 
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-use crate::numbers::{NAMES, Numbers, OF_COLOR, OF_DEPTH, OF_OTHERS, OF_POSE, OF_RECOGNITION};
+use crate::numbers::{NAMES, Numbers, OF_COLOR, OF_DEPTH, OF_OTHERS, OF_POSE, OF_SEARCH};
 use crate::regression::{Fit, LogisticModel, fit};
 
 /// Version of the file format.
-const VERSION: u32 = 1;
+const VERSION: u32 = 2;
 
 /// Why a calibration cannot be used.
 #[derive(Debug, Error)]
@@ -42,8 +42,10 @@ pub struct Calibration {
     names: Vec<String>,
     /// With depth alone.
     depth: LogisticModel,
-    /// With colour alone.
+    /// With colour alone, for the pose of one instance from a search of the whole image.
     color: LogisticModel,
+    /// With colour alone, for a pose in a given region and for several instances: without the numbers of such a search.
+    color_without_search: LogisticModel,
     /// With both.
     both: LogisticModel,
 }
@@ -76,46 +78,51 @@ impl Calibration {
         if read.names != NAMES {
             return Err(content("field names: found other numbers than this version knows".to_owned()));
         }
-        let models = [("depth", &read.depth), ("color", &read.color), ("both", &read.both)];
+        let models = [
+            ("depth", &read.depth),
+            ("color", &read.color),
+            ("color_without_search", &read.color_without_search),
+            ("both", &read.both),
+        ];
         if let Some((name, _)) = models.into_iter().find(|(_, model)| !model.is_whole()) {
             return Err(content(format!("field {name}: found lists of other lengths, or no finite numbers")));
         }
         Ok(read)
     }
 
-    /// Fits the three models, for depth alone, colour alone and both; each from its rows and from those of them that would be
-    /// reported. For an empty list the shipped model is kept.
+    /// Fits the models for depth alone, colour alone (with and without the numbers of a search) and both; each from its rows and from those of them
+    /// that would be reported. For an empty list the shipped model is kept.
     ///
     /// # Errors
     /// As [`Calibration::shipped`].
     pub fn fitted(rows: [(&[Fit<'_>], &[Fit<'_>]); 3]) -> Result<Calibration, CalibrationError> {
-        let takes =
-            |ranges: &[std::ops::Range<usize>]| -> Vec<usize> { ranges.iter().cloned().flatten().collect() };
-        let takes = [
-            takes(&[OF_DEPTH, OF_OTHERS]),
-            takes(&[OF_COLOR, OF_OTHERS, OF_POSE, OF_RECOGNITION]),
-            takes(&[OF_DEPTH, OF_COLOR, OF_OTHERS, OF_RECOGNITION]),
-        ];
-        let model =
-            |k: usize, kept: fn(Calibration) -> LogisticModel| -> Result<LogisticModel, CalibrationError> {
-                let (all, reported) = rows[k];
-                if all.is_empty() {
-                    Ok(kept(Calibration::shipped()?))
-                } else {
-                    Ok(fit(all, &takes[k]).scaled_to(reported))
-                }
-            };
-        let (depth, color, both) = (model(0, |c| c.depth)?, model(1, |c| c.color)?, model(2, |c| c.both)?);
-        Ok(Calibration { version: VERSION, names: NAMES.map(str::to_owned).to_vec(), depth, color, both })
+        let kept = Calibration::shipped()?;
+        let model = |(all, reported): (&[Fit<'_>], &[Fit<'_>]),
+                     ranges: &[std::ops::Range<usize>],
+                     kept: LogisticModel| {
+            let takes: Vec<usize> = ranges.iter().cloned().flatten().collect();
+            if all.is_empty() { kept } else { fit(all, &takes).scaled_to(reported) }
+        };
+        let [depth, color, both] = rows;
+        Ok(Calibration {
+            version: VERSION,
+            names: NAMES.map(str::to_owned).to_vec(),
+            depth: model(depth, &[OF_DEPTH, OF_OTHERS], kept.depth),
+            color: model(color, &[OF_COLOR, OF_OTHERS, OF_POSE, OF_SEARCH], kept.color),
+            color_without_search: model(color, &[OF_COLOR, OF_OTHERS, OF_POSE], kept.color_without_search),
+            both: model(both, &[OF_DEPTH, OF_COLOR, OF_OTHERS], kept.both),
+        })
     }
 
     /// The probability that a pose is right; 0 if no number of it is known.
     pub fn probability(&self, numbers: &Numbers) -> f64 {
         let known = |mut range: std::ops::Range<usize>| range.any(|k| numbers[k].is_some());
+        let searched = OF_SEARCH.into_iter().all(|k| numbers[k].is_some());
         match (known(OF_DEPTH), known(OF_COLOR)) {
             (true, true) => self.both.probability(numbers),
             (true, false) => self.depth.probability(numbers),
-            (false, true) => self.color.probability(numbers),
+            (false, true) if searched => self.color.probability(numbers),
+            (false, true) => self.color_without_search.probability(numbers),
             (false, false) => 0.0,
         }
     }
@@ -139,7 +146,7 @@ mod tests {
         let broken = |from: &str, to: &str| {
             Calibration::parse(&text.replacen(from, to, 1), "x.json").unwrap_err().to_string()
         };
-        assert!(broken("\"version\": 1", "\"version\": 9").contains("field version: found 9, expected 1"));
+        assert!(broken("\"version\": 2", "\"version\": 9").contains("field version: found 9, expected 2"));
         assert!(broken("\"pixels\"", "\"inches\"").contains("field names"));
         assert!(broken("\"scaling\": [", "\"scaling\": [1,").contains("x.json"));
         let none = Calibration::read(Path::new("/nowhere/calibration.json")).unwrap_err().to_string();
@@ -165,10 +172,35 @@ mod tests {
             ("similarity", 0.9),
         ];
         let others = [("gap_here", 0.4), ("gap_elsewhere", 0.4)];
-        let at =
-            |diameters: f64| probability(&[&image[..], &others, &[("distance", diameters.ln())]].concat());
-        let [near, middle, far] = [3.0, 6.0, 12.0].map(at);
-        assert!(near > 0.8 && far < middle && middle < near - 0.05, "{near} {middle} {far}");
+        let at = |diameters: f64, search: &[(&str, f64)]| {
+            probability(&[&image[..], &others, search, &[("distance", diameters.ln())]].concat())
+        };
+        // In a given region, of several instances, and of one that is searched in the whole image.
+        let recognised = [("recognised", 0.4), ("support", 0.8)];
+        for search in [&[][..], &recognised[..1], &recognised] {
+            let [near, middle, far] = [3.0, 6.0, 12.0].map(|diameters| at(diameters, search));
+            assert!(near > 0.8 && far < middle && middle < near - 0.02, "{near} {middle} {far}");
+        }
+        assert_eq!(at(6.0, &[]), at(6.0, &recognised[..1]));
+    }
+
+    #[test]
+    fn a_pose_to_which_few_searches_lead_is_less_probable() {
+        let image = [
+            ("edges", 0.8),
+            ("background_edges", 0.2),
+            ("correlation", 0.4),
+            ("tint", 0.1),
+            ("similarity", 0.7),
+            ("gap_here", 0.4),
+            ("gap_elsewhere", 0.1),
+            ("distance", 1.7),
+        ];
+        let of = |recognised: f64, support: f64| {
+            probability(&[&image[..], &[("recognised", recognised), ("support", support)]].concat())
+        };
+        let (sure, alone, unlike) = (of(0.4, 0.8), of(0.4, 0.05), of(0.05, 0.8));
+        assert!(sure > alone + 0.2 && sure > unlike + 0.05, "{sure} {alone} {unlike}");
     }
 
     #[test]

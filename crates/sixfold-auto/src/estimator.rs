@@ -12,7 +12,6 @@ use sixfold_estimator::{
 };
 use sixfold_geometry::{Pose, RgbImage};
 use sixfold_mesh::Mesh;
-use sixfold_views::Recogniser;
 
 use crate::calibration::{Calibration, CalibrationError};
 use crate::hypotheses::{Hypothesis, Pool};
@@ -47,8 +46,6 @@ pub struct AutoEstimator {
     pub budget: Option<Duration>,
     /// Run all methods, even if the first ones are certain.
     pub ask_all: bool,
-    /// Compares poses with the colour image; without one the probabilities do without this comparison.
-    pub recogniser: Option<Arc<Recogniser>>,
 }
 
 impl AutoEstimator {
@@ -64,7 +61,6 @@ impl AutoEstimator {
             depth: DepthOptions::default(),
             budget: None,
             ask_all: false,
-            recogniser: None,
         })
     }
 
@@ -165,7 +161,6 @@ impl AutoEstimator {
             symmetries: &surface.symmetries,
             look_alikes,
             calibration: &self.calibration,
-            recogniser: self.recogniser.as_deref(),
             one_instance: query.max_instances == 1,
             hypotheses: vec![],
             asked: 0,
@@ -173,6 +168,7 @@ impl AutoEstimator {
         let start = Instant::now();
         let asked = Query {
             rgb: color.map(|c| c.0),
+            runners_up: MORE,
             ..query.passed_on(query.max_instances.saturating_add(MORE), 0.0)
         };
         let mut possible = 0;
@@ -199,7 +195,7 @@ impl AutoEstimator {
                     continue;
                 }
             };
-            pool.add(member.as_ref(), member.estimate(prepared.as_ref().as_ref(), &asked)?)?;
+            pool.add(member.as_ref(), member.estimate(prepared.as_ref().as_ref(), &asked)?);
         }
         if possible == 0 && !notes.is_empty() {
             return Err(EstimatorError::method(notes.join("; ")));

@@ -3,14 +3,13 @@
 use rayon::prelude::*;
 use sixfold_align::evidence::{EvidenceCollector, Scene, Shape};
 use sixfold_align::{Evidence, VerificationOptions, Verifier, align_to_depth, refine};
-use sixfold_estimator::{EstimatorError, Need, PoseEstimate, PoseEstimator};
+use sixfold_estimator::{Need, PoseEstimate, PoseEstimator};
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_mesh::Mesh;
-use sixfold_views::Recogniser;
 
 use crate::calibration::Calibration;
 use crate::lookalikes::LookAlikes;
-use crate::numbers::{Numbers, add_others, of_evidence, strength};
+use crate::numbers::{Numbers, Reported, add_others, of_evidence, strength};
 
 /// Poses whose points are less than this fraction of the diameter apart are the same; [`SAME_BY_COLOR`] for methods on colour
 /// alone, which have larger errors along the view axis. Chosen by hand; not swept.
@@ -47,8 +46,6 @@ pub(crate) struct Pool<'a> {
     /// Rotations that depth alone cannot distinguish.
     pub look_alikes: &'a LookAlikes,
     pub calibration: &'a Calibration,
-    /// Compares poses with the colour image.
-    pub recogniser: Option<&'a Recogniser>,
     pub one_instance: bool,
     pub hypotheses: Vec<Hypothesis>,
     pub asked: usize,
@@ -56,24 +53,17 @@ pub(crate) struct Pool<'a> {
 
 impl Pool<'_> {
     /// Adds the poses that a method found, and recomputes all probabilities.
-    ///
-    /// # Errors
-    /// [`EstimatorError::Method`] if the output of the recogniser's network cannot be read.
-    pub(crate) fn add(
-        &mut self,
-        method: &dyn PoseEstimator,
-        found: Vec<PoseEstimate>,
-    ) -> Result<(), EstimatorError> {
+    pub(crate) fn add(&mut self, method: &dyn PoseEstimator, found: Vec<PoseEstimate>) {
         self.asked += 1;
         let by_depth = method.needs().depth != Need::Unused;
         let (scene, shape, diameter) = (&self.scene, &self.shape, self.diameter);
-        let look_alikes = self.look_alikes;
+        let (look_alikes, one_instance) = (self.look_alikes, self.one_instance);
         let options = VerificationOptions::default();
-        let judged: Result<Vec<Option<Hypothesis>>, EstimatorError> = found
+        let judged: Vec<Option<Hypothesis>> = found
             .into_par_iter()
             .map_init(EvidenceCollector::default, |collector, mut estimate| {
                 if !is_before_camera(&estimate.camera_from_object, shape.mesh, diameter) {
-                    return Ok(None);
+                    return None;
                 }
                 let mut evidence = collector.collect(scene, shape, &estimate.camera_from_object, &options);
                 if !by_depth
@@ -90,31 +80,24 @@ impl Pool<'_> {
                 {
                     (estimate.camera_from_object, evidence) = other;
                 }
-                let similarity = estimate.details.get("similarity").and_then(serde_json::Value::as_f64);
-                let recognised = match (self.recogniser, &scene.color) {
-                    (Some(recogniser), Some((image, _))) => recogniser
-                        .similarity(shape.colored, image, scene.camera, &estimate.camera_from_object)
-                        .map_err(EstimatorError::method)?,
-                    _ => None,
-                };
+                let reported = Reported::of(&estimate, one_instance);
                 let name = method.name();
                 let distance = centre(&estimate.camera_from_object, shape.mesh).z;
-                Ok(Some(Hypothesis {
+                Some(Hypothesis {
                     method: name,
                     found_by: vec![name],
-                    numbers: of_evidence(&evidence, similarity, recognised, distance / diameter),
-                    strength: strength(&evidence, similarity),
+                    numbers: of_evidence(&evidence, &reported, distance / diameter),
+                    strength: strength(&evidence, reported.similarity),
                     estimate,
                     evidence,
                     probability: 0.0,
-                }))
+                })
             })
             .collect();
-        for hypothesis in judged?.into_iter().flatten() {
+        for hypothesis in judged.into_iter().flatten() {
             self.join(hypothesis);
         }
         self.compare();
-        Ok(())
     }
 
     /// Adds a hypothesis, or merges it with an equal one.

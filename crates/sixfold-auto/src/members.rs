@@ -11,14 +11,10 @@ use sixfold_mttm::{MttmEstimator, MttmOptions};
 use sixfold_pix2pose::model::Pix2PoseModel;
 use sixfold_pix2pose::own_weights::OwnWeights;
 use sixfold_ppf::PpfEstimator;
+use sixfold_views::ViewsRefiner;
 use sixfold_views::estimator::ViewsEstimator;
-use sixfold_views::{Recogniser, ViewsRefiner};
 
 use crate::estimator::AutoEstimator;
-
-/// Places of a colour image in which views are searched: the number with which the probabilities were fitted. With more, more objects that are
-/// absent could be reported.
-const PLACES: usize = 8;
 
 /// Which methods are included.
 #[derive(Debug, Clone, Copy, Default)]
@@ -66,13 +62,11 @@ impl AutoMembers<'_> {
         if !self.without_views {
             let mut views = ViewsEstimator::shipped().map_err(EstimatorError::method)?;
             views.options.seed = self.seed;
-            views.options.places = PLACES;
             let proposals = TrainedDetector::proposals().map_err(EstimatorError::method)?;
             members.push(Arc::new(views.with_proposals(Arc::new(proposals))));
         }
         let mut auto = AutoEstimator::new(members).map_err(EstimatorError::method)?;
         auto.depth = self.depth;
-        auto.recogniser = Some(Arc::new(Recogniser::shipped().map_err(EstimatorError::method)?));
         Ok(auto)
     }
 }

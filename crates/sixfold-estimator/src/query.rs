@@ -49,6 +49,8 @@ pub struct Query<'a> {
     pub region: Option<&'a Region>,
     /// Maximum number of instances of an object, 1 or more.
     pub max_instances: usize,
+    /// How many of these are wanted only to see how certain the others are: a method need not spend time on finding them.
+    pub runners_up: usize,
     /// Estimates with a lower confidence are left out; 0 or more. Confidences are 0 to 1, so a value above 1 leaves out all.
     pub min_confidence: f64,
     /// Whether images for people are wanted.
@@ -73,6 +75,7 @@ impl<'a> Query<'a> {
             depth: self.depth,
             region: self.region,
             max_instances,
+            runners_up: 0,
             min_confidence,
             diagnostics: self.diagnostics,
             memo: self.memo.clone(),
@@ -89,6 +92,7 @@ impl<'a> Query<'a> {
             depth: None,
             region: None,
             max_instances: 1,
+            runners_up: 0,
             min_confidence: 0.0,
             diagnostics: false,
             memo: Memo::default(),

@@ -144,7 +144,7 @@ impl ViewsDetector {
         let views = self.estimator.views(object);
         let alike = views.most_alike(places, self.estimator.options.places);
         let located = views.located(&alike, places, image, camera, true).map_err(EstimatorError::method)?;
-        let candidate = |(agreement, (pose, _)): Scored<usize>| {
+        let candidate = |Scored { pose, score: agreement, .. }: Scored<usize>| {
             let pose = pose.camera_from_object;
             let bbox = projected_box(views.outline, camera, &pose)?;
             let shown = Shown::Posed(object, pose);

@@ -224,13 +224,14 @@ impl PoseEstimator for ViewsEstimator {
         let keypoints = (!object.printed.views.is_empty())
             .then(|| query.image_memo.get_or_default::<KeptKeypoints>().of_image(image));
         let keypoints = keypoints.as_deref();
-        let estimate = |pose: &Hypothesis, score: f64| {
+        let estimate = |pose: &Hypothesis, score: f64, details: &[(&str, f64)]| {
             let confidence = pose.similarity.clamp(0.0, 1.0) * score;
             let mut estimate = PoseEstimate::new(pose.camera_from_object, confidence);
-            estimate.details = Map::from_iter([
+            let details = details.iter().map(|(name, value)| ((*name).to_owned(), json!(value)));
+            estimate.details = Map::from_iter(details.chain([
                 ("similarity".to_owned(), json!(pose.similarity)),
                 ("inliers".to_owned(), json!(pose.inliers)),
-            ]);
+            ]));
             (confidence >= query.min_confidence).then_some(estimate)
         };
         let Some(region) = query.region else {
@@ -242,11 +243,14 @@ impl PoseEstimator for ViewsEstimator {
             let sizes = [self.options.proposals, self.options.side];
             let kept: Arc<Places> = query.image_memo.get_or_default();
             let places = kept.of_image(proposals, &self.extractor, image, query.camera, sizes)?;
-            let found = views.search(image, query.camera, &places, keypoints, query.max_instances);
+            let number = [query.max_instances, query.runners_up];
+            let found = views.search(image, query.camera, &places, keypoints, number);
             return Ok(found
                 .map_err(EstimatorError::method)?
                 .iter()
-                .filter_map(|h| estimate(h, 1.0))
+                .filter_map(|f| {
+                    estimate(&f.pose, 1.0, &[("recognised", f.recognised), ("support", f.support)])
+                })
                 .collect());
         };
         let found =
@@ -258,7 +262,7 @@ impl PoseEstimator for ViewsEstimator {
             );
             return Err(EstimatorError::Region { source: source.into() });
         };
-        Ok(found.first().and_then(|h| estimate(h, region.score)).into_iter().collect())
+        Ok(found.first().and_then(|h| estimate(h, region.score, &[])).into_iter().collect())
     }
 }
 
@@ -321,5 +325,18 @@ mod tests {
         let found = estimator.estimate(prepared.as_ref(), &query).unwrap();
         assert!(!found.is_empty() && found.len() <= 3);
         assert!(found[0].camera_from_object.distance_to(&truth) < 0.05);
+        // The same with what tells the pose from other places, if two of the three are only runners-up.
+        let query = Query { rgb: Some(&image), max_instances: 3, runners_up: 2, ..Query::new(&camera) };
+        let found = estimator.estimate(prepared.as_ref(), &query).unwrap();
+        assert!(!found.is_empty() && found.len() <= 3);
+        assert!(found[0].camera_from_object.distance_to(&truth) < 0.05);
+        let number = |name: &str| found[0].details[name].as_f64().unwrap();
+        let (recognised, support) = (number("recognised"), number("support"));
+        assert!(recognised > 0.05 && support > 0.1 && support <= 1.0 + 1e-9, "{recognised} {support}");
+        // In a given region there is no search of the image.
+        let region = Region::of_box(bbox);
+        let query = Query { rgb: Some(&image), region: Some(&region), ..Query::new(&camera) };
+        let found = estimator.estimate(prepared.as_ref(), &query).unwrap();
+        assert!(found[0].details.contains_key("similarity") && !found[0].details.contains_key("support"));
     }
 }
