@@ -267,8 +267,9 @@ impl Views<'_> {
 
     /// The poses on which most of the others agree first, with their support.
     fn agreed(&self, poses: &[Scored<()>], camera: &Camera) -> Vec<Found> {
-        let [votes, supports] = [(ALIKE, VOTES), (SUPPORT, 2)]
-            .map(|(near, power)| self.sums_of_alike(poses, camera, near, power));
+        let apart = self.apart(poses, camera);
+        let [votes, supports] =
+            [(ALIKE, VOTES), (SUPPORT, 2)].map(|(near, power)| sums_of_alike(poses, &apart, near, power));
         let total: f64 = poses.iter().map(|scored| scored.score.powi(2)).sum();
         let mut agreed: Vec<(f64, Found)> = Vec::new();
         for ((scored, votes), support) in poses.iter().zip(votes).zip(supports) {
@@ -280,22 +281,21 @@ impl Views<'_> {
         agreed.into_iter().map(|(_, found)| found).collect()
     }
 
-    /// For each pose the sum of the scores, to some power, of all poses whose corners are not farther from its own than the fraction `near` of its size in
-    /// the image; 0 for a pose that is not before the camera.
-    fn sums_of_alike<T>(&self, poses: &[Scored<T>], camera: &Camera, near: f64, power: i32) -> Vec<f64> {
+    /// How far the corners of each pose are from those of every other in the image at most, and its own size there, pixels; no distance to a pose that is not
+    /// before the camera.
+    fn apart<T>(&self, poses: &[Scored<T>], camera: &Camera) -> Vec<(f64, Vec<Option<f64>>)> {
         let corners: Vec<Option<[Vec2; 8]>> =
             poses.iter().map(|scored| self.corners(camera, &scored.pose.camera_from_object)).collect();
-        let sum = |(scored, own): (&Scored<T>, &Option<[Vec2; 8]>)| {
-            let bbox = projected_box(self.outline, camera, &scored.pose.camera_from_object);
-            let near = near * bbox.map_or(0.0, |bbox| bbox.area().sqrt());
-            let alike = |other: &Option<[Vec2; 8]>| match (own, other) {
-                (Some(own), Some(other)) => own.iter().zip(other).all(|(a, b)| (a - b).norm() <= near),
-                _ => false,
-            };
-            let of_alike = poses.iter().zip(&corners).filter(|(_, other)| alike(other));
-            of_alike.map(|(scored, _)| scored.score.powi(power)).sum()
+        let distance = |a: &Option<[Vec2; 8]>, b: &Option<[Vec2; 8]>| {
+            let pairs = a.as_ref()?.iter().zip(b.as_ref()?);
+            Some(pairs.map(|(a, b)| (a - b).norm()).fold(0.0, f64::max))
         };
-        poses.iter().zip(&corners).map(sum).collect()
+        let apart = |(scored, own): (&Scored<T>, &Option<[Vec2; 8]>)| {
+            let bbox = projected_box(self.outline, camera, &scored.pose.camera_from_object);
+            let size = bbox.map_or(0.0, |bbox| bbox.area().sqrt());
+            (size, corners.iter().map(|other| distance(own, other)).collect())
+        };
+        poses.iter().zip(&corners).map(apart).collect()
     }
 
     /// The corners of the object's bounding box in the image; `None` if one is not before the camera.
@@ -338,6 +338,22 @@ impl Views<'_> {
             _ => self.same(a, b),
         }
     }
+}
+
+/// For each pose the sum of the scores, to some power, of all poses that are not farther `apart` ([`Views::apart`]) than the fraction `near` of its size in
+/// the image; 0 for a pose that is not before the camera.
+fn sums_of_alike<T>(
+    poses: &[Scored<T>],
+    apart: &[(f64, Vec<Option<f64>>)],
+    near: f64,
+    power: i32,
+) -> Vec<f64> {
+    let sum = |(size, distances): &(f64, Vec<Option<f64>>)| {
+        let alike = |distance: &Option<f64>| distance.is_some_and(|distance| distance <= near * size);
+        let of_alike = poses.iter().zip(distances).filter(|(_, distance)| alike(distance));
+        of_alike.map(|(scored, _)| scored.score.powi(power)).sum()
+    };
+    apart.iter().map(sum).collect()
 }
 
 /// The first `most` of some poses with the numbers of their places and, if `of_each` place, the first there.
@@ -552,7 +568,8 @@ mod tests {
             Scored { pose, more: 0.1 * score, score: *score, of: () }
         };
         let sums = |poses: &[(Pose, f64)], near: f64| {
-            views.sums_of_alike(&poses.iter().map(scored).collect::<Vec<_>>(), &camera, near, 2)
+            let poses: Vec<_> = poses.iter().map(scored).collect();
+            sums_of_alike(&poses, &views.apart(&poses, &camera), near, 2)
         };
         let poses = [(truth, 3.0), (moved(0.03), 1.0), (moved(0.1), 2.0), (behind, 1.0)];
         assert_eq!(sums(&poses, 0.06), [10.0, 10.0, 4.0, 0.0]);
