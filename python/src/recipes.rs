@@ -201,8 +201,9 @@ pub(crate) fn train_detector<'py>(
 /// Trains the network for grasps from experience (dissertation, chapter 6) on synthetic objects. DgcmNet.load reads the model.
 ///
 /// Returns a dict with model (its path), steps, seconds, losses, quality. quality is measured on pairs of views of objects that were
-/// not used in the training: pairs (their number), coordinates (mean error of one coordinate, range -1 to 1), own (the same if the
-/// view's own coordinates are taken), families (coordinates for each family).
+/// not used in the training: pairs (their number), coordinates (mean error of one coordinate, range -1 to 1), decoded (the same
+/// before the alignment of both views), own (the same if the view's own coordinates are taken), families (coordinates for each
+/// family).
 ///
 /// out, progress, interruption and resuming: as train_pix2pose. The first stage is "preparing".
 /// network: "compact" or the dissertation's "paper".
@@ -236,6 +237,7 @@ pub(crate) fn train_dgcm<'py>(
         network: choice("network", network, default.network)?,
         encoder,
         init: None,
+        alignment_only: false,
         steps: self::steps(steps)?,
         pairs: pairs.map(|n| whole("pairs", n, 0)).transpose()?,
         learning_rate,

@@ -10,6 +10,7 @@
 #![deny(clippy::print_stdout, clippy::print_stderr)]
 #![warn(unreachable_pub, unnameable_types)]
 
+mod alignment_loss;
 pub mod learner;
 mod loss;
 pub mod model;
@@ -21,6 +22,6 @@ mod samples;
 mod training;
 pub mod transfer;
 
-pub use networks::{Compact, Encoded, Network, Paper};
+pub use networks::{Alignment, Compact, Encoded, Network, Paper};
 pub use samples::{GraspPoolOptions, Pair, PairOptions, Pool, View};
 pub use training::{Batch, DgcmTraining, DgcmTrainingOptions};

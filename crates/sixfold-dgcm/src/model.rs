@@ -11,7 +11,7 @@ use sixfold_nn::weights::{
     write_card_markdown,
 };
 
-use crate::networks::{Encoded, FEATURE, Network};
+use crate::networks::{Encoded, FEATURE, Network, numbers};
 
 /// Why a model could not be read.
 #[derive(Debug, thiserror::Error)]
@@ -143,7 +143,7 @@ impl DgcmModel {
         assert_eq!(crop.side, self.crop.side, "a crop of another size than the network's");
         let planes = [crop.normal_planes(), crop.vd_noc_planes()].concat();
         let encoded = self.network.geometry(self.tensor(planes, 1));
-        let feature = numbers(encoded.feature.clone());
+        let feature = numbers(&encoded.feature);
         InputCode { encoded, feature }
     }
 
@@ -162,7 +162,9 @@ impl DgcmModel {
         assert_eq!((features.len(), vd_noc.len()), (count * FEATURE, count * 3 * pixels));
         let features = Tensor::<2>::from_data(TensorData::new(features, [count, FEATURE]), &self.device);
         let code = self.network.vd_noc(self.tensor(vd_noc, count));
-        let out = numbers(self.network.decode(&input.encoded.repeat(count), features, &code));
+        let input = input.encoded.repeat(count);
+        let decoded = self.network.decode(&input, features, &code);
+        let out = numbers(&self.network.aligned(decoded, &input, &code));
         out.chunks_exact(3 * pixels)
             .map(|image| (0..pixels).map(|i| [0, 1, 2].map(|k| image[k * pixels + i])).collect())
             .collect()
@@ -195,10 +197,6 @@ fn check_crop(crop: &CropOptions) -> Result<(), (&'static str, &'static str, Str
         return Err(("extra.crop.min_pixels", "1 to the pixels of the crop", crop.min_pixels.to_string()));
     }
     Ok(())
-}
-
-fn numbers<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
-    tensor.into_data().try_to_vec().unwrap_or_else(|error| unreachable!("f32 output: {error:?}"))
 }
 
 impl FeatureExtractor for DgcmModel {

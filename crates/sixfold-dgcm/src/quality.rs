@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
 
-use crate::networks::{Network, VIEW};
+use crate::networks::{Network, VIEW, numbers};
 use crate::samples::{PairOptions, Pool};
 
 /// Pairs per forward pass.
@@ -20,6 +20,8 @@ pub struct Quality {
     pub pairs: usize,
     /// Error of the prediction (equation 6.3).
     pub coordinates: f64,
+    /// Error of the decoder, before the alignment of both views.
+    pub decoded: f64,
     /// Error if the view's own coordinates are taken as they are.
     pub own: f64,
     /// Error of the prediction for each family.
@@ -28,9 +30,10 @@ pub struct Quality {
 
 impl Quality {
     /// Names and values, for display.
-    pub fn scores(&self) -> [(&'static str, f64); 2] {
+    pub fn scores(&self) -> [(&'static str, f64); 3] {
         [
             ("mean error of a coordinate (range -1 to 1)", self.coordinates),
+            ("the same before the alignment", self.decoded),
             ("the same if the view's own coordinates are taken", self.own),
         ]
     }
@@ -42,7 +45,7 @@ pub fn quality(network: &Network, pool: &Pool, pairs: usize) -> Quality {
     let pixels = side * side;
     let options = PairOptions::default();
     let mut errors: BTreeMap<String, (f64, usize)> = BTreeMap::new();
-    let mut own = 0.0;
+    let (mut own, mut before) = (0.0, 0.0);
     for start in (0..pairs).step_by(AT_A_TIME) {
         let batch: Vec<_> = (start..(start + AT_A_TIME).min(pairs))
             .map(|number| pool.pair(true, &options, 0x9a, number as u64))
@@ -55,9 +58,11 @@ pub fn quality(network: &Network, pool: &Pool, pairs: usize) -> Quality {
         let experience =
             network.geometry(planes(batch.iter().flat_map(|p| p.experience.clone()).collect(), VIEW));
         let code = network.vd_noc(planes(batch.iter().flat_map(|p| p.vd_noc.clone()).collect(), 3));
-        let found = network.decode(&input, experience.feature, &code).into_data().try_to_vec::<f32>();
-        let found = found.unwrap_or_else(|error| unreachable!("f32 output: {error:?}"));
-        for (pair, found) in batch.iter().zip(found.chunks_exact(3 * pixels)) {
+        let decoded = network.decode(&input, experience.feature, &code);
+        let found = numbers(&network.aligned(decoded.clone(), &input, &code));
+        let decoded = numbers(&decoded);
+        let results = found.chunks_exact(3 * pixels).zip(decoded.chunks_exact(3 * pixels));
+        for (pair, (found, decoded)) in batch.iter().zip(results) {
             let error = |of: &[f32]| {
                 let on_object = (0..3 * pixels).filter(|i| pair.mask[i % pixels] > 0.0);
                 let (sum, count) = on_object.fold((0.0, 0usize), |(sum, count), i| {
@@ -68,12 +73,14 @@ pub fn quality(network: &Network, pool: &Pool, pairs: usize) -> Quality {
             let family = errors.entry(pair.families.0.name().to_owned()).or_default();
             *family = (family.0 + error(found), family.1 + 1);
             own += error(&pair.input[3 * pixels..]);
+            before += error(decoded);
         }
     }
     let sum: f64 = errors.values().map(|e| e.0).sum();
     Quality {
         pairs,
         coordinates: sum / pairs.max(1) as f64,
+        decoded: before / pairs.max(1) as f64,
         own: own / pairs.max(1) as f64,
         families: errors.into_iter().map(|(family, (sum, count))| (family, sum / count as f64)).collect(),
     }
@@ -91,9 +98,10 @@ mod tests {
         // With random weights the transformation is near the identity, and the difference from it is small.
         let network = Network::Compact(CompactConfig.init(1, &Device::flex()));
         let quality = quality(&network, &pool, 20);
-        assert!((quality.coordinates - quality.own).abs() < 0.3 * quality.own, "{quality:?}");
+        assert!((quality.decoded - quality.own).abs() < 0.3 * quality.own, "{quality:?}");
         let of_families: f64 = quality.families.values().sum::<f64>() / quality.families.len() as f64;
         assert!(quality.own > 0.05 && (of_families - quality.coordinates).abs() < 0.15, "{quality:?}");
+        assert!(quality.coordinates != quality.decoded, "the alignment is measured: {quality:?}");
         assert_eq!(quality.pairs, 20);
     }
 }

@@ -8,7 +8,7 @@ use sixfold_nn::fingerprint::Fingerprint;
 use sixfold_nn::options::OptionError;
 use sixfold_nn::recipe::{Prepared, Recipe, Session, TrainingEvent, continued_from};
 use sixfold_nn::train_error::TrainError;
-use sixfold_nn::weights::{ModelCard, load_weights};
+use sixfold_nn::weights::{ModelCard, load_weights_but};
 
 use crate::model::DgcmModel;
 use crate::networks::{CompactConfig, Network, PaperConfig};
@@ -80,6 +80,8 @@ pub struct DgcmRecipe {
     pub encoder: Option<PathBuf>,
     /// Weights of a trained network of this kind to start from; random ones if `None`.
     pub init: Option<PathBuf>,
+    /// Whether only the alignment of both views is trained, and everything else stays as in `init`.
+    pub alignment_only: bool,
     /// Number of steps; `None`: the value of [`DgcmKind::options`], as for the next three fields.
     pub steps: Option<u64>,
     /// Positive pairs in a step; the dissertation's network uses the same number of negative ones.
@@ -102,6 +104,7 @@ impl Default for DgcmRecipe {
             network: DgcmKind::Compact,
             encoder: None,
             init: None,
+            alignment_only: false,
             steps: None,
             pairs: None,
             learning_rate: None,
@@ -127,6 +130,7 @@ impl DgcmRecipe {
             pairs: self.pairs.unwrap_or(default.pairs),
             negatives: self.pairs.filter(|_| self.network == DgcmKind::Paper).unwrap_or(default.negatives),
             lambda: self.lambda.unwrap_or(default.lambda),
+            alignment_only: self.alignment_only,
             ..default
         }
     }
@@ -157,13 +161,16 @@ impl Recipe for DgcmRecipe {
         let wrong = self.encoder.is_some() && self.network == DgcmKind::Compact;
         let expected = "network paper; the compact network starts from random weights";
         OptionError::unless(!wrong, "encoder", "one for the compact network", expected)?;
+        let possible = self.network == DgcmKind::Compact && self.init.is_some();
+        let expected = "network compact, and init: the rest of the network stays as it is there";
+        OptionError::unless(possible || !self.alignment_only, "alignment_only", "no such network", expected)?;
         self.options().check()
     }
 
     fn inputs(&self, (): &()) -> Result<Fingerprint, TrainError> {
         // Every field by name, so that the compiler reports a new one; fields left out are in the options or have no effect.
         #[rustfmt::skip]
-        let DgcmRecipe { network, encoder, init, views, steps: _, pairs: _, lambda: _, learning_rate: _, seed: _, command: _ } = self;
+        let DgcmRecipe { network, encoder, init, alignment_only: _, views, steps: _, pairs: _, lambda: _, learning_rate: _, seed: _, command: _ } = self;
         Fingerprint::of(&self.options())?
             .with("network", network.name())
             .with("views", *views)
@@ -187,7 +194,10 @@ impl Recipe for DgcmRecipe {
         };
         if let Some(file) = &self.init {
             let architecture = network.architecture();
-            (network, _) = load_weights(network, file, architecture).map_err(TrainError::about("init"))?;
+            // Weights of before there was an alignment have no such part.
+            let without = Some("Compact.alignment");
+            (network, _) =
+                load_weights_but(network, file, architecture, without).map_err(TrainError::about("init"))?;
         }
         let options = self.options();
         let pool = GraspPoolOptions { views: self.views, seed: self.seed, ..self.network.pool() };

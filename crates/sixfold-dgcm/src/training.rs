@@ -1,5 +1,6 @@
 //! The training of DGCM-Net: pairs through the network, the losses of equations 6.2 to 6.4, AdamW.
 
+use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
 use sixfold_nn::learner::{Checkpointed, Learner};
@@ -8,8 +9,9 @@ use sixfold_nn::schedule::LearningRate;
 use sixfold_nn::train_error::TrainError;
 use sixfold_nn::training::{Batches, Losses, Plan, Training};
 
+use crate::alignment_loss::{Decoded, alignment_loss};
 use crate::loss::{MARGIN, coordinate_loss, cross_loss, metric_loss};
-use crate::networks::{Network, VIEW};
+use crate::networks::{Network, VIEW, numbers};
 use crate::samples::{GraspPoolOptions, Pair, PairOptions, Pool};
 use sixfold_synth::shapes::Family;
 
@@ -32,6 +34,9 @@ pub struct DgcmTrainingOptions {
     /// How often the learning rate is divided by ten, at equal intervals; 0: it follows a cosine.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub divisions: u64,
+    /// Whether only the alignment of both views is trained, and everything else stays as it is.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub alignment_only: bool,
 }
 
 fn is_zero(number: &u64) -> bool {
@@ -55,6 +60,7 @@ impl Default for DgcmTrainingOptions {
             cross_pairs: 1.0,
             samples: PairOptions::default(),
             divisions: 0,
+            alignment_only: false,
         }
     }
 }
@@ -80,6 +86,11 @@ impl DgcmTrainingOptions {
             cross_pairs: 0.0,
             ..default
         }
+    }
+
+    /// Pairs in a step: positive and negative ones.
+    fn in_step(&self) -> (usize, usize) {
+        (self.pairs, if self.alignment_only { 0 } else { self.negatives })
     }
 
     /// Checks every number.
@@ -110,6 +121,34 @@ impl DgcmTraining {
         DgcmTraining { learner, options, pace: Pace::default(), device }
     }
 
+    fn images(&self, values: Vec<f32>, count: usize, channels: usize) -> Tensor<4> {
+        let side = self.learner.network().side();
+        Tensor::from_data(TensorData::new(values, [count, channels, side, side]), &self.device)
+    }
+
+    /// A step in which only the alignment learns: the rest of the network runs without gradients.
+    fn step_of_alignment(&mut self, batch: Batch, rate: f64) -> Losses {
+        let network = self.learner.network();
+        let (pairs, seed) = (self.options.pairs, self.options.common.seed);
+        let tensor = |values, channels| self.images(values, pairs, channels);
+        let (target, mask) = (tensor(batch.target, 3), tensor(batch.mask, 1));
+        let fixed = network.valid();
+        let input = fixed.geometry(tensor(batch.input, VIEW).inner());
+        let feature = fixed.geometry(tensor(batch.experience, VIEW).inner()).feature;
+        let code = fixed.vd_noc(tensor(batch.vd_noc, 3).inner());
+        let coordinates = Tensor::from_inner(fixed.decode(&input, feature, &code));
+        let decoded = Decoded { coordinates, input: input.learnable(), code: code.learnable() };
+        let Some(aligned) = alignment_loss(network, decoded, &target, &mask, (seed, batch.step)) else {
+            return Losses::new();
+        };
+        let losses = [
+            ("error on the object", value(&aligned.before)),
+            ("aligned error on the object", value(&aligned.after)),
+        ];
+        self.learner.descend(rate, aligned.sum);
+        losses.into_iter().map(|(name, value)| (name.to_owned(), value)).collect()
+    }
+
     /// The trained network.
     pub fn into_network(self) -> Network {
         self.learner.into_network()
@@ -125,6 +164,8 @@ pub struct Batch {
     mask: Vec<f32>,
     /// Families of both views of every pair.
     families: Vec<(Family, Family)>,
+    /// Number of the step.
+    step: u64,
 }
 
 fn make_batch(pool: &Pool, options: &DgcmTrainingOptions, step: u64) -> Batch {
@@ -135,8 +176,10 @@ fn make_batch(pool: &Pool, options: &DgcmTrainingOptions, step: u64) -> Batch {
         target: vec![],
         mask: vec![],
         families: vec![],
+        step,
     };
-    for (positive, count) in [(true, options.pairs as u64), (false, options.negatives as u64)] {
+    let (positives, negatives) = options.in_step();
+    for (positive, count) in [(true, positives as u64), (false, negatives as u64)] {
         for number in 0..count {
             let number = 2 * (step * count + number) + u64::from(positive);
             let pair: Pair = pool.pair(positive, &options.samples, options.common.seed, number);
@@ -162,6 +205,10 @@ fn divided(common: &TrainingOptions, divisions: u64) -> LearningRate {
     LearningRate::StepDecay { rate: common.learning_rate, factor: 0.1, at }
 }
 
+fn value(tensor: &Tensor<1>) -> f64 {
+    numbers(&tensor.clone().inner()).first().map_or(f64::NAN, |v| f64::from(*v))
+}
+
 impl Training for DgcmTraining {
     type Samples = Pool;
     type Batch = Batch;
@@ -181,7 +228,8 @@ impl Training for DgcmTraining {
             architecture: self.learner.network().architecture(),
             margin: MARGIN,
         };
-        let plan = Plan::new(&options.common, options.pairs + options.negatives, self.pace, &settings)?;
+        let (positives, negatives) = options.in_step();
+        let plan = Plan::new(&options.common, positives + negatives, self.pace, &settings)?;
         Ok(match options.divisions {
             0 => plan,
             _ => Plan { schedule: divided(&options.common, options.divisions), ..plan },
@@ -194,12 +242,13 @@ impl Training for DgcmTraining {
     }
 
     fn step(&mut self, batch: Batch, rate: f64) -> Losses {
+        if self.options.alignment_only {
+            return self.step_of_alignment(batch, rate);
+        }
         let network = self.learner.network();
-        let (pairs, side) = (self.options.pairs, network.side());
+        let (pairs, seed) = (self.options.pairs, self.options.common.seed);
         let all = pairs + self.options.negatives;
-        let tensor = |values: Vec<f32>, count: usize, channels: usize| {
-            Tensor::<4>::from_data(TensorData::new(values, [count, channels, side, side]), &self.device)
-        };
+        let tensor = |values, count, channels| self.images(values, count, channels);
         let input = network.geometry(tensor(batch.input, all, VIEW));
         let experience = network.geometry(tensor(batch.experience, all, VIEW));
         let (metric, near, far) = metric_loss(&input.feature, &experience.feature, pairs);
@@ -212,27 +261,28 @@ impl Training for DgcmTraining {
         let cross = cross_loss(&input.feature, &experience.feature, different);
         let code = network.vd_noc(tensor(batch.vd_noc, pairs, 3));
         let features = experience.feature.narrow(0, 0, pairs);
-        let out = network.decode(&input.narrow(0, pairs), features, &code);
-        let (coordinates, error) =
-            coordinate_loss(out, tensor(batch.target, pairs, 3), tensor(batch.mask, pairs, 1));
-        let numbers = [&metric, &cross, &coordinates, &near, &far, &error].map(|t| {
-            let value: Vec<f32> = t.clone().inner().into_data().try_to_vec().unwrap_or_default();
-            value.first().map_or(f64::NAN, |v| f64::from(*v))
-        });
-        let sum = metric + cross * self.options.cross_pairs + coordinates * self.options.lambda;
+        let input = input.narrow(0, pairs);
+        let out = network.decode(&input, features, &code);
+        let (target, mask) = (tensor(batch.target, pairs, 3), tensor(batch.mask, pairs, 1));
+        let decoded =
+            Decoded { coordinates: out.clone().detach(), input: input.detached(), code: code.detached() };
+        let aligned = alignment_loss(network, decoded, &target, &mask, (seed, batch.step));
+        let (coordinates, error) = coordinate_loss(out, target, mask);
+        let mut losses = vec![
+            ("metric", value(&metric)),
+            ("cross pairs", value(&cross)),
+            ("coordinates", value(&coordinates)),
+            ("positive distance", value(&near)),
+            ("negative distance", value(&far)),
+            ("error on the object", value(&error)),
+        ];
+        let mut sum = metric + cross * self.options.cross_pairs + coordinates * self.options.lambda;
+        if let Some(aligned) = aligned {
+            losses.push(("aligned error on the object", value(&aligned.after)));
+            sum = sum + aligned.sum * self.options.lambda;
+        }
         self.learner.descend(rate, sum);
-        [
-            "metric",
-            "cross pairs",
-            "coordinates",
-            "positive distance",
-            "negative distance",
-            "error on the object",
-        ]
-        .into_iter()
-        .map(str::to_owned)
-        .zip(numbers)
-        .collect()
+        losses.into_iter().map(|(name, value)| (name.to_owned(), value)).collect()
     }
 
     fn learners(&mut self) -> Vec<&mut dyn Checkpointed> {
@@ -288,6 +338,32 @@ mod tests {
         println!("{:.3?} {:.4?}", of("metric"), of("coordinates"));
         assert!(of("metric")[13] < 0.5 * of("metric")[0], "{:?}", of("metric"));
         assert!(of("coordinates")[13] < 0.8 * of("coordinates")[0], "{:?}", of("coordinates"));
+    }
+
+    #[test]
+    fn the_alignment_learns_and_the_rest_stays() {
+        let pool = Pool::new(&GraspPoolOptions { views: 64, ..GraspPoolOptions::default() }, &()).unwrap();
+        let device = Device::flex().autodiff();
+        let options =
+            DgcmTrainingOptions { pairs: 4, alignment_only: true, ..DgcmTrainingOptions::default() };
+        let network = Network::Compact(CompactConfig.init(3, &device));
+        let code = |n: &Network| -> Vec<f32> {
+            let x = Tensor::<4>::ones([1, VIEW, 96, 96], &Device::flex()) * 0.5;
+            let code = n.vd_noc(x.clone().narrow(1, 0, 3));
+            let view = n.geometry(x);
+            let out = n.decode(&view, view.feature.clone(), &code);
+            [numbers(&out), view.feature.into_data().try_to_vec().unwrap()].concat()
+        };
+        let before = code(&network.valid());
+        let mut training = DgcmTraining::new(network, options.clone(), device);
+        let losses: Vec<Losses> =
+            (0..40).map(|_| training.step(make_batch(&pool, &options, 0), 1e-3)).collect();
+        let of = |name: &str| losses.iter().map(|l| l[name]).collect::<Vec<f64>>();
+        let (decoded, aligned) = (of("error on the object"), of("aligned error on the object"));
+        println!("{decoded:.3?} {aligned:.3?}");
+        assert!(decoded.iter().all(|error| *error == decoded[0]));
+        assert!(aligned[39] < 0.7 * decoded[0] && aligned[39] < 0.7 * aligned[0], "{aligned:?}");
+        assert_eq!(before, code(&training.into_network()));
     }
 
     #[test]

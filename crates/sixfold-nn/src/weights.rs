@@ -260,10 +260,24 @@ pub fn load_weights<M: Module>(
     expected_architecture: &str,
 ) -> Result<(M, ModelCard), WeightsError> {
     // The card is read first: it is small, and gives the best error for a file of another kind.
+    load_weights_but(module, path, expected_architecture, None)
+}
+
+/// [`load_weights`] from a file that may lack all tensors whose names begin with `without`: these keep their values. For a training
+/// that continues from the weights of a network without this part.
+///
+/// # Errors
+/// As [`load_weights`].
+pub fn load_weights_but<M: Module>(
+    module: M,
+    path: &Path,
+    expected_architecture: &str,
+    without: Option<&str>,
+) -> Result<(M, ModelCard), WeightsError> {
     read_card(path)?;
     let bytes = sixfold_io::read_regular(path, sixfold_io::limits::WEIGHTS)
         .map_err(|source| WeightsError::Read { file: path.to_owned(), source })?;
-    load_weights_from_bytes(module, path, &bytes, expected_architecture)
+    load(module, path, &bytes, expected_architecture, without)
 }
 
 /// [`load_weights`] from the content of a file, for shipped weights; `path` names them in errors.
@@ -276,10 +290,20 @@ pub fn load_weights_from_bytes<M: Module>(
     bytes: &[u8],
     expected_architecture: &str,
 ) -> Result<(M, ModelCard), WeightsError> {
+    load(module, path, bytes, expected_architecture, None)
+}
+
+fn load<M: Module>(
+    module: M,
+    path: &Path,
+    bytes: &[u8],
+    expected_architecture: &str,
+    without: Option<&str>,
+) -> Result<(M, ModelCard), WeightsError> {
     // Running statistics still pending in other threads would later replace the loaded ones.
     drop(module.valid());
     let mut module = Network::new(module);
-    let card = load_parameters(&mut module, path, bytes, expected_architecture)?;
+    let card = load_parameters(&mut module, path, bytes, expected_architecture, without)?;
     Ok((module.into_inner(), card))
 }
 
@@ -288,6 +312,7 @@ fn load_parameters(
     path: &Path,
     bytes: &[u8],
     expected_architecture: &str,
+    without: Option<&str>,
 ) -> Result<ModelCard, WeightsError> {
     let broken = |reason: String| WeightsError::Broken { file: path.to_owned(), reason };
     let (_, header) = SafeTensors::read_metadata(bytes).map_err(|e| broken(e.to_string()))?;
@@ -307,8 +332,9 @@ fn load_parameters(
         });
     }
     let file = SafeTensors::deserialize(bytes).map_err(|e| broken(e.to_string()))?;
-    let tensors = file.tensors().into_iter().collect();
-    let mut filler = Filler { file: path, path: Vec::new(), tensors, error: None };
+    let tensors: BTreeMap<String, TensorView<'_>> = file.tensors().into_iter().collect();
+    let without = without.filter(|part| !tensors.keys().any(|name| name.starts_with(part)));
+    let mut filler = Filler { file: path, path: Vec::new(), tensors, without, error: None };
     module.change(&mut filler);
     if let Some(error) = filler.error {
         return Err(error);
@@ -488,6 +514,8 @@ struct Filler<'a> {
     file: &'a Path,
     path: Vec<String>,
     tensors: BTreeMap<String, TensorView<'a>>,
+    /// Tensors whose names begin with this keep their values.
+    without: Option<&'a str>,
     error: Option<WeightsError>,
 }
 
@@ -499,6 +527,7 @@ impl<'a> Filler<'a> {
         }
         let (file, tensor, expected) = (self.file.to_owned(), self.path.join("."), expected.to_vec());
         match self.tensors.remove(&tensor) {
+            None if self.without.is_some_and(|part| tensor.starts_with(part)) => {}
             None => self.error = Some(WeightsError::Missing { file, tensor, expected }),
             Some(view) if view.shape() != expected => {
                 let found = view.shape().to_vec();
@@ -703,6 +732,20 @@ mod tests {
         more.heads.push(LinearConfig::new(4, 1).init(&device));
         let error = message(load_weights(more, &path, "test-net").unwrap_err());
         assert!(error.contains("tensor heads.2.weight: expected shape [4, 1], found no tensor"), "{error}");
+
+        // A part that the file lacks altogether may keep its values if it is named; not a tensor of a part that the file has.
+        let mut more = net(4, &device);
+        more.heads.push(LinearConfig::new(4, 1).init(&device));
+        let kept: Vec<f32> = more.heads[2].weight.val().try_into_vec_as().unwrap();
+        let (loaded, _) = load_weights_but(more.clone(), &path, "test-net", Some("heads.2")).unwrap();
+        assert_eq!(loaded.heads[2].weight.val().try_into_vec_as::<f32>().unwrap(), kept);
+        for part in ["heads", "conv"] {
+            let error = message(load_weights_but(more.clone(), &path, "test-net", Some(part)).unwrap_err());
+            assert!(
+                error.contains("tensor heads.2.weight: expected shape [4, 1], found no tensor"),
+                "{part}: {error}"
+            );
+        }
 
         let mut less = net(4, &device);
         less.heads.pop();

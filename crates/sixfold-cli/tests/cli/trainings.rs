@@ -103,6 +103,14 @@ fn trainings_without_data_know_their_options_before_they_make_anything() {
     let card = std::fs::read_to_string(dir.join("more/model.md")).unwrap();
     assert!(card.contains("continued_from") && card.contains("dgcm/model.safetensors"), "{card}");
     fails(dir, "train dgcm --init none.safetensors --views 64 --out fresh", &["init", "none.safetensors"]);
+    // The alignment alone.
+    let alignment =
+        "train dgcm --alignment-only --init more/model.safetensors --steps 1 --views 64 --pairs 2";
+    let run = sixfold(dir, &format!("{alignment} --out aligned"));
+    run.expect(0);
+    assert!(run.stderr.contains("after alignment") && !run.stderr.contains("metric"), "{}", run.stderr);
+    fails(dir, &alignment.replace("--init more/model.safetensors", "--out fresh"), &["--init"]);
+    fails(dir, &format!("{alignment} --out fresh --network paper"), &["alignment_only", "network compact"]);
 }
 
 #[test]

@@ -21,7 +21,7 @@ use sixfold_nn::kernels::Activation;
 use sixfold_nn::layers::{Conv, ConvConfig};
 use sixfold_nn::ops::{pixel_shuffle, upsample};
 
-use super::{Encoded, FEATURE, VIEW, half};
+use super::{Alignment, Encoded, FEATURE, VIEW, half, moved, shown};
 
 /// Slope of LeakyReLU in the dense layers.
 const SLOPE: f64 = 0.1;
@@ -80,6 +80,7 @@ impl CompactConfig {
             pair: pair.map(|c| down(c, rng)).to_vec(),
             pair_out: dense([PAIR * smallest, FEATURE], rng, device),
             affine: dense([FEATURE, 12], rng, device),
+            alignment: Alignment::init(rng, device),
         }
     }
 }
@@ -100,6 +101,8 @@ pub struct Compact {
     pair: Vec<Conv>,
     pair_out: Linear,
     affine: Linear,
+    /// Moves the decoder's coordinates by comparing both views.
+    pub(crate) alignment: Alignment,
 }
 
 sixfold_nn::displayed_by_name!(Compact);
@@ -153,37 +156,7 @@ impl Compact {
         }
         let view = input.input.clone();
         let own = view.clone().narrow(1, 3, 3);
-        let object = view.narrow(1, 0, 3).square().sum_dim(1).greater_elem(0.0).float();
+        let object = shown(view);
         (moved(own, affine) + pixel_shuffle(self.head.forward(x), 4)) * object
-    }
-}
-
-/// Coordinates (`batch x 3 x side x side`) after an affine transformation each, given by its difference from the identity: the rows of
-/// its matrix, each followed by the translation (`batch x 12`).
-fn moved(coordinates: Tensor<4>, affine: Tensor<2>) -> Tensor<4> {
-    let [batch, _, height, width] = coordinates.dims();
-    let affine = affine.reshape([batch, 3, 4]);
-    let (matrix, translation) = (affine.clone().narrow(2, 0, 3), affine.narrow(2, 3, 1));
-    let flat = coordinates.reshape([batch, 3, height * width]);
-    (flat.clone() + matrix.matmul(flat) + translation).reshape([batch, 3, height, width])
-}
-
-#[cfg(test)]
-mod tests {
-    use burn::tensor::TensorData;
-
-    use super::*;
-
-    #[test]
-    fn an_affine_transformation_moves_every_pixel() {
-        let device = Device::flex();
-        // Two pixels, (1, 2, 3) and (4, 5, 6).
-        let points = vec![1.0f32, 4.0, 2.0, 5.0, 3.0, 6.0];
-        let points = Tensor::<4>::from_data(TensorData::new(points, [1, 3, 1, 2]), &device);
-        // x + 2 y + 0.5, y, z - x.
-        let affine = vec![0.0f32, 2.0, 0.0, 0.5, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0];
-        let affine = Tensor::<2>::from_data(TensorData::new(affine, [1, 12]), &device);
-        let found: Vec<f32> = moved(points, affine).into_data().try_to_vec().unwrap();
-        assert_eq!(found, [5.5, 14.5, 2.0, 5.0, 2.0, 2.0]);
     }
 }

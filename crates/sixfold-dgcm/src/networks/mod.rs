@@ -1,11 +1,14 @@
 //! DGCM-Net (dissertation, section 6.2.2, figure 6.3): a geometry encoder, a VD-NOC encoder and a VD-NOC decoder.
 
+mod alignment;
 mod compact;
 mod paper;
 
 use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 
+pub use alignment::Alignment;
+pub(crate) use alignment::{NODES, interpolated, on_object, shifted};
 pub use compact::Compact;
 pub(crate) use compact::CompactConfig;
 pub use paper::Paper;
@@ -16,6 +19,9 @@ pub(crate) const FEATURE: usize = sixfold_experience::FEATURE;
 
 /// Planes of a view: three of normals, three of its own VD-NOC.
 pub(crate) const VIEW: usize = 6;
+
+/// Rounds of alignment.
+pub(crate) const ROUNDS: usize = 3;
 
 /// An encoder's output for a batch.
 #[derive(Debug, Clone)]
@@ -38,7 +44,26 @@ impl Encoded {
         }
     }
 
-    /// A batch of one, repeated.
+    /// Every tensor changed by `f`, but no maps, which an alignment does not need.
+    fn mapped(
+        &self,
+        image: impl Fn(Tensor<4>) -> Tensor<4>,
+        feature: impl Fn(Tensor<2>) -> Tensor<2>,
+    ) -> Encoded {
+        Encoded { input: image(self.input.clone()), feature: feature(self.feature.clone()), maps: vec![] }
+    }
+
+    /// Input and feature without gradients.
+    pub(crate) fn detached(&self) -> Encoded {
+        self.mapped(Tensor::detach, Tensor::detach)
+    }
+
+    /// Input and feature on the autodiff device, of an encoding that is not.
+    pub(crate) fn learnable(&self) -> Encoded {
+        self.mapped(Tensor::from_inner, Tensor::from_inner)
+    }
+
+    /// The batch, repeated.
     pub fn repeat(&self, count: usize) -> Encoded {
         Encoded {
             input: self.input.clone().repeat_dim(0, count),
@@ -118,11 +143,67 @@ impl Network {
             Network::Paper(n) => n.decode(input, experience, code),
         }
     }
+
+    /// The field of shifts of a round of alignment, from the coordinates before it; `None` for the dissertation's network, which
+    /// has no alignment.
+    pub(crate) fn field(
+        &self,
+        coordinates: &Tensor<4>,
+        input: &Encoded,
+        code: &Encoded,
+    ) -> Option<Tensor<4>> {
+        let Network::Compact(n) = self else { return None };
+        Some(n.alignment.field(coordinates, &input.input, input.feature.clone(), &code.input))
+    }
+
+    /// The decoder's coordinates after the rounds of alignment, if the network has one.
+    pub fn aligned(&self, decoded: Tensor<4>, input: &Encoded, code: &Encoded) -> Tensor<4> {
+        (0..ROUNDS).fold(decoded, |x, _| match self.field(&x, input, code) {
+            Some(field) => shifted(&x, &field, &input.input),
+            None => x,
+        })
+    }
+}
+
+/// The values of a tensor.
+pub(crate) fn numbers<const D: usize>(tensor: &Tensor<D>) -> Vec<f32> {
+    let values = tensor.clone().into_data().try_to_vec();
+    values.unwrap_or_else(|error| unreachable!("f32 tensor: {error:?}"))
+}
+
+/// 1 where a view (`batch x 6 x side x side`) shows the object.
+fn shown(view: Tensor<4>) -> Tensor<4> {
+    view.narrow(1, 0, 3).square().sum_dim(1).greater_elem(0.0).float()
+}
+
+/// Coordinates (`batch x 3 x side x side`) after an affine transformation each, given by its difference from the identity: the rows of
+/// its matrix, each followed by the translation (`batch x 12`).
+pub(crate) fn moved(coordinates: Tensor<4>, affine: Tensor<2>) -> Tensor<4> {
+    let [batch, _, height, width] = coordinates.dims();
+    let affine = affine.reshape([batch, 3, 4]);
+    let (matrix, translation) = (affine.clone().narrow(2, 0, 3), affine.narrow(2, 3, 1));
+    let flat = coordinates.reshape([batch, 3, height * width]);
+    (flat.clone() + matrix.matmul(flat) + translation).reshape([batch, 3, height, width])
 }
 
 #[cfg(test)]
 mod tests {
+    use burn::tensor::TensorData;
+
     use super::*;
+
+    #[test]
+    fn an_affine_transformation_moves_every_pixel() {
+        let device = Device::flex();
+        // Two pixels, (1, 2, 3) and (4, 5, 6).
+        let points = vec![1.0f32, 4.0, 2.0, 5.0, 3.0, 6.0];
+        let points = Tensor::<4>::from_data(TensorData::new(points, [1, 3, 1, 2]), &device);
+        // x + 2 y + 0.5, y, z - x.
+        let affine = vec![0.0f32, 2.0, 0.0, 0.5, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0];
+        let affine = Tensor::<2>::from_data(TensorData::new(affine, [1, 12]), &device);
+        let found: Vec<f32> = moved(points, affine).into_data().try_to_vec().unwrap();
+        assert_eq!(found, [5.5, 14.5, 2.0, 5.0, 2.0, 2.0]);
+    }
 
     fn shapes(network: &Network, batch: usize) {
         let device = Device::flex();
@@ -141,7 +222,7 @@ mod tests {
     #[test]
     fn the_compact_network_is_small() {
         let network = Network::of_architecture("dgcm-compact", &Device::flex()).unwrap();
-        assert!(network.num_params() < 4_000_000, "{}", network.num_params());
+        assert!(network.num_params() < 5_000_000, "{}", network.num_params());
         shapes(&network, 2);
     }
 

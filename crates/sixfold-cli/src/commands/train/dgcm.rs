@@ -46,6 +46,9 @@ pub(crate) struct TrainDgcmArguments {
     /// Continue from the weights of such a training
     #[arg(long, value_name = "FILE.safetensors")]
     pub init: Option<PathBuf>,
+    /// Train only the alignment of both views; everything else stays as in --init
+    #[arg(long, requires = "init")]
+    pub alignment_only: bool,
     #[arg(long, value_name = "N", help = help("Training steps", |k| k.options().common.steps.to_string()))]
     pub steps: Option<u64>,
     #[arg(long, value_name = "N", help = pairs_help())]
@@ -78,6 +81,7 @@ impl TrainDgcmArguments {
             network: self.network.unwrap_or(default.network),
             encoder: self.encoder.clone(),
             init: self.init.clone(),
+            alignment_only: self.alignment_only,
             steps: self.steps,
             pairs: self.pairs,
             learning_rate: self.learning_rate,
@@ -103,14 +107,15 @@ pub(super) fn train_dgcm(a: &TrainDgcmArguments) -> Result<Summary<OnViews>> {
         preparing: "views",
         measuring: "test views",
         message: |record| {
-            format!(
-                "metric {:.2}, distance {:.2} of similar and {:.2} of different pairs, coordinates off by {:.3}, {:.0} pairs/s",
-                loss(record, "metric"),
-                loss(record, "positive distance"),
-                loss(record, "negative distance"),
-                loss(record, "error on the object"),
-                record.samples_per_second
-            )
+            let of = |name| record.losses.contains_key(name).then(|| loss(record, name));
+            let metric = of("metric").map_or(String::new(), |metric| {
+                let (near, far) = (loss(record, "positive distance"), loss(record, "negative distance"));
+                format!("metric {metric:.2}, distance {near:.2} of similar and {far:.2} of different pairs, ")
+            });
+            let aligned = of("aligned error on the object");
+            let aligned = aligned.map_or(String::new(), |error| format!(" ({error:.3} after alignment)"));
+            let (off, speed) = (loss(record, "error on the object"), record.samples_per_second);
+            format!("{metric}coordinates off by {off:.3}{aligned}, {speed:.0} pairs/s")
         },
     };
     let trained = train_in(&recipe, (), &a.result.out, a.result.export, shown)?;
