@@ -161,9 +161,13 @@ impl Recipe for DgcmRecipe {
         let wrong = self.encoder.is_some() && self.network == DgcmKind::Compact;
         let expected = "network paper; the compact network starts from random weights";
         OptionError::unless(!wrong, "encoder", "one for the compact network", expected)?;
-        let possible = self.network == DgcmKind::Compact && self.init.is_some();
-        let expected = "network compact, and init: the rest of the network stays as it is there";
-        OptionError::unless(possible || !self.alignment_only, "alignment_only", "no such network", expected)?;
+        if self.alignment_only {
+            let expected = "network compact, which has an alignment";
+            let found = format!("network {}", self.network.name());
+            OptionError::unless(self.network == DgcmKind::Compact, "alignment_only", found, expected)?;
+            let expected = "init: weights whose other parts stay as they are";
+            OptionError::unless(self.init.is_some(), "alignment_only", "no init", expected)?;
+        }
         self.options().check()
     }
 

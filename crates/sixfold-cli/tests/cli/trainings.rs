@@ -106,11 +106,10 @@ fn trainings_without_data_know_their_options_before_they_make_anything() {
     // The alignment alone.
     let alignment =
         "train dgcm --alignment-only --init more/model.safetensors --steps 1 --views 64 --pairs 2";
-    let run = sixfold(dir, &format!("{alignment} --out aligned"));
-    run.expect(0);
+    let run = sixfold(dir, &format!("{alignment} --out aligned")).expect(0);
     assert!(run.stderr.contains("after alignment") && !run.stderr.contains("metric"), "{}", run.stderr);
     fails(dir, &alignment.replace("--init more/model.safetensors", "--out fresh"), &["--init"]);
-    fails(dir, &format!("{alignment} --out fresh --network paper"), &["alignment_only", "network compact"]);
+    fails(dir, &format!("{alignment} --out fresh --network paper"), &["--alignment-only", "network compact"]);
 }
 
 #[test]
