@@ -248,16 +248,20 @@ mod tests {
 
     #[test]
     fn points_are_drawn_into_the_four_cells_around_them() {
-        // At x = y = 0 the four middle cells are equally near; the second point is outside.
-        let points = [0.0, 9.0, 0.0, 0.0, 0.6, 0.6];
+        // A quarter of a cell right of the middle, where four cells meet; the second point is outside.
+        let quarter = 0.25 * 2.0 * HALF / CELLS as f32;
+        let points = [quarter, 9.0, 0.0, 0.0, 0.6, 0.6];
         let planes = drawn(&points, |_| true, &[&[0.25, 7.0]]);
         let (n, middle) = (CELLS * CELLS, CELLS / 2);
-        for (row, column) in
-            [(middle - 1, middle - 1), (middle - 1, middle), (middle, middle - 1), (middle, middle)]
-        {
+        for (row, column, weight) in [
+            (middle - 1, middle - 1, 0.125),
+            (middle - 1, middle, 0.375),
+            (middle, middle - 1, 0.125),
+            (middle, middle, 0.375),
+        ] {
             let cell = row * CELLS + column;
             let found = [0, 1, 2].map(|k| planes[k * n + cell]);
-            assert!(found.iter().zip([0.25, 0.6, 0.25]).all(|(a, b)| (a - b).abs() < 1e-5), "{found:?}");
+            assert!(found.iter().zip([weight, 0.6, 0.25]).all(|(a, b)| (a - b).abs() < 1e-5), "{found:?}");
         }
         assert!((planes[..n].iter().sum::<f32>() - 1.0).abs() < 1e-5);
     }
