@@ -164,7 +164,7 @@ impl DgcmModel {
         let code = self.network.vd_noc(self.tensor(vd_noc, count));
         let input = input.encoded.repeat(count);
         let decoded = self.network.decode(&input, features, &code);
-        let out = numbers(&self.network.aligned(decoded, &input, &code));
+        let out = self.network.aligned(&decoded, &input, &code);
         out.chunks_exact(3 * pixels)
             .map(|image| (0..pixels).map(|i| [0, 1, 2].map(|k| image[k * pixels + i])).collect())
             .collect()

@@ -59,7 +59,7 @@ pub fn quality(network: &Network, pool: &Pool, pairs: usize) -> Quality {
             network.geometry(planes(batch.iter().flat_map(|p| p.experience.clone()).collect(), VIEW));
         let code = network.vd_noc(planes(batch.iter().flat_map(|p| p.vd_noc.clone()).collect(), 3));
         let decoded = network.decode(&input, experience.feature, &code);
-        let found = numbers(&network.aligned(decoded.clone(), &input, &code));
+        let found = network.aligned(&decoded, &input, &code);
         let decoded = numbers(&decoded);
         let results = found.chunks_exact(3 * pixels).zip(decoded.chunks_exact(3 * pixels));
         for (pair, (found, decoded)) in batch.iter().zip(results) {

@@ -133,14 +133,18 @@ impl DgcmTraining {
         let tensor = |values, channels| self.images(values, pairs, channels);
         let (target, mask) = (tensor(batch.target, 3), tensor(batch.mask, 1));
         let fixed = network.valid();
-        let input = fixed.geometry(tensor(batch.input, VIEW).inner());
-        let feature = fixed.geometry(tensor(batch.experience, VIEW).inner()).feature;
-        let code = fixed.vd_noc(tensor(batch.vd_noc, 3).inner());
-        let coordinates = Tensor::from_inner(fixed.decode(&input, feature, &code));
-        let decoded = Decoded { coordinates, input: input.learnable(), code: code.learnable() };
-        let Some(aligned) = alignment_loss(network, decoded, &target, &mask, (seed, batch.step)) else {
-            return Losses::new();
+        let views = tensor(batch.input, VIEW);
+        let vd_noc = tensor(batch.vd_noc, 3);
+        let input = fixed.geometry(views.clone().inner());
+        let experience = fixed.geometry(tensor(batch.experience, VIEW).inner()).feature;
+        let code = fixed.vd_noc(vd_noc.clone().inner());
+        let coordinates = Tensor::from_inner(fixed.decode(&input, experience, &code));
+        let feature = Tensor::from_inner(input.feature);
+        let decoded = Decoded { coordinates, views, feature, vd_noc };
+        let Some(alignment) = network.alignment() else {
+            unreachable!("a plan of a network without alignment is refused")
         };
+        let aligned = alignment_loss(alignment, decoded, &target, &mask, (seed, batch.step));
         let losses = [
             ("error on the object", value(&aligned.before)),
             ("aligned error on the object", value(&aligned.after)),
@@ -218,6 +222,8 @@ impl Training for DgcmTraining {
         options.check()?;
         let views = pool.views().len();
         OptionError::unless(views >= 16, "views", views, "at least 16")?;
+        let possible = !options.alignment_only || self.learner.network().alignment().is_some();
+        OptionError::unless(possible, "alignment_only", "a network without", "a network with an alignment")?;
         let (side, expected) = (pool.options().crop.side, self.learner.network().side());
         let found = format!("views of {side}, network of {expected}");
         let fits = side == expected;
@@ -264,9 +270,11 @@ impl Training for DgcmTraining {
         let input = input.narrow(0, pairs);
         let out = network.decode(&input, features, &code);
         let (target, mask) = (tensor(batch.target, pairs, 3), tensor(batch.mask, pairs, 1));
-        let decoded =
-            Decoded { coordinates: out.clone().detach(), input: input.detached(), code: code.detached() };
-        let aligned = alignment_loss(network, decoded, &target, &mask, (seed, batch.step));
+        let aligned = network.alignment().map(|alignment| {
+            let (coordinates, feature) = (out.clone().detach(), input.feature.detach());
+            let decoded = Decoded { coordinates, views: input.input, feature, vd_noc: code.input };
+            alignment_loss(alignment, decoded, &target, &mask, (seed, batch.step))
+        });
         let (coordinates, error) = coordinate_loss(out, target, mask);
         let mut losses = vec![
             ("metric", value(&metric)),

@@ -8,7 +8,7 @@ use burn::module::Module;
 use burn::tensor::{Device, Tensor};
 
 pub use alignment::Alignment;
-pub(crate) use alignment::{NODES, interpolated, on_object, shifted};
+pub(crate) use alignment::{NODES, Pairs, interpolated};
 pub use compact::Compact;
 pub(crate) use compact::CompactConfig;
 pub use paper::Paper;
@@ -44,26 +44,7 @@ impl Encoded {
         }
     }
 
-    /// Every tensor changed by `f`, but no maps, which an alignment does not need.
-    fn mapped(
-        &self,
-        image: impl Fn(Tensor<4>) -> Tensor<4>,
-        feature: impl Fn(Tensor<2>) -> Tensor<2>,
-    ) -> Encoded {
-        Encoded { input: image(self.input.clone()), feature: feature(self.feature.clone()), maps: vec![] }
-    }
-
-    /// Input and feature without gradients.
-    pub(crate) fn detached(&self) -> Encoded {
-        self.mapped(Tensor::detach, Tensor::detach)
-    }
-
-    /// Input and feature on the autodiff device, of an encoding that is not.
-    pub(crate) fn learnable(&self) -> Encoded {
-        self.mapped(Tensor::from_inner, Tensor::from_inner)
-    }
-
-    /// The batch, repeated.
+    /// A batch of one, repeated.
     pub fn repeat(&self, count: usize) -> Encoded {
         Encoded {
             input: self.input.clone().repeat_dim(0, count),
@@ -144,24 +125,25 @@ impl Network {
         }
     }
 
-    /// The field of shifts of a round of alignment, from the coordinates before it; `None` for the dissertation's network, which
-    /// has no alignment.
-    pub(crate) fn field(
-        &self,
-        coordinates: &Tensor<4>,
-        input: &Encoded,
-        code: &Encoded,
-    ) -> Option<Tensor<4>> {
-        let Network::Compact(n) = self else { return None };
-        Some(n.alignment.field(coordinates, &input.input, input.feature.clone(), &code.input))
+    /// The alignment of both views; the dissertation's network has none.
+    pub(crate) fn alignment(&self) -> Option<&Alignment> {
+        match self {
+            Network::Compact(n) => Some(&n.alignment),
+            Network::Paper(_) => None,
+        }
     }
 
-    /// The decoder's coordinates after the rounds of alignment, if the network has one.
-    pub fn aligned(&self, decoded: Tensor<4>, input: &Encoded, code: &Encoded) -> Tensor<4> {
-        (0..ROUNDS).fold(decoded, |x, _| match self.field(&x, input, code) {
-            Some(field) => shifted(&x, &field, &input.input),
-            None => x,
-        })
+    /// The values of the decoder's coordinates after the rounds of alignment, if the network has one.
+    pub(crate) fn aligned(&self, decoded: &Tensor<4>, input: &Encoded, code: &Encoded) -> Vec<f32> {
+        let mut coordinates = numbers(decoded);
+        if let Some(alignment) = self.alignment() {
+            let pairs = Pairs::new(&input.input, input.feature.clone(), &code.input);
+            for _ in 0..ROUNDS {
+                let field = alignment.field(&coordinates, &pairs);
+                pairs.shift(&mut coordinates, &field);
+            }
+        }
+        coordinates
     }
 }
 
