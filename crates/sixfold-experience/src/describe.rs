@@ -1,11 +1,11 @@
 //! Human-readable descriptions of an experience: its numbers without the images, and a visualisation.
 
 use serde::Serialize;
-use sixfold_geometry::{Image, RgbImage};
-use sixfold_grasp::{DrawnGrasp, draw_grasps};
+use sixfold_geometry::{Image, Pose, RgbImage};
+use sixfold_grasp::{DrawnGrasp, Gripper, draw_grasps};
 use sixfold_mesh::MeshError;
 
-use super::{Experience, Stored, Summary};
+use super::{Crop, Experience, Stored, Summary};
 
 /// An experience without its images, as `sixfold grasp store export` writes it.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -71,28 +71,11 @@ impl Experience {
     /// # Errors
     /// [`MeshError`] for a gripper whose sizes are not finite.
     pub fn picture(&self) -> Result<RgbImage, MeshError> {
-        const ZOOM: usize = 4;
         let crop = &self.crop;
         let side = crop.side * ZOOM;
-        let color = |values: &[[f32; 3]]| -> RgbImage {
-            Image::from_fn(side, side, |x, y| {
-                let i = (y / ZOOM) * crop.side + x / ZOOM;
-                if crop.mask[i] {
-                    values[i].map(|v| (127.5 + 127.5 * v).clamp(0.0, 255.0) as u8)
-                } else {
-                    [24; 3]
-                }
-            })
-        };
-        let normals = color(&crop.normals);
-        let camera = crop.camera.resize(side, side);
-        let drawn = [DrawnGrasp {
-            camera_from_gripper: self.camera_from_gripper,
-            opening: self.opening,
-            color: [60, 220, 80],
-        }];
-        let with_gripper = draw_grasps(&normals, None, &camera, &self.gripper, &drawn)?;
-        let vd_noc = color(&crop.vd_noc);
+        let normals = colors(crop, &crop.normals);
+        let with_gripper = self.with_gripper()?;
+        let vd_noc = colors(crop, &crop.vd_noc);
         let region = Image::from_fn(side, side, |x, y| {
             let i = (y / ZOOM) * crop.side + x / ZOOM;
             if self.region[i] { [240, 170, 40] } else { normals[(x, y)] }
@@ -103,4 +86,54 @@ impl Experience {
             _ => region[(x - 2 * side, y)],
         }))
     }
+
+    /// Normals with the gripper.
+    fn with_gripper(&self) -> Result<RgbImage, MeshError> {
+        grasp_on(&self.crop, &self.camera_from_gripper, self.opening, &self.gripper)
+    }
+}
+
+/// An object beside the experiences nearest to it (dissertation, figure 6.8): normals above, VD-NOC below, a column each, of crops of
+/// the same size. The grippers are that of `grasp` (pose, opening in metres and gripper) and those of the experiences.
+///
+/// # Errors
+/// [`MeshError`] for a gripper whose sizes are not finite.
+pub fn picture_with_nearest(
+    crop: &Crop,
+    grasp: Option<(&Pose, f64, &Gripper)>,
+    nearest: &[&Experience],
+) -> Result<RgbImage, MeshError> {
+    let first = match grasp {
+        Some((pose, opening, gripper)) => grasp_on(crop, pose, opening, gripper)?,
+        None => colors(crop, &crop.normals),
+    };
+    let mut columns = vec![[first, colors(crop, &crop.vd_noc)]];
+    for experience in nearest {
+        columns.push([experience.with_gripper()?, colors(&experience.crop, &experience.crop.vd_noc)]);
+    }
+    let side = crop.side * ZOOM;
+    let at = |x: usize, y: usize| columns[x / side][y / side].get(x % side, y % side).copied();
+    // Stored crops of another network may be smaller.
+    Ok(Image::from_fn(columns.len() * side, 2 * side, |x, y| at(x, y).unwrap_or(OUTSIDE)))
+}
+
+/// Pixels of a picture for each pixel of a crop, along each axis.
+const ZOOM: usize = 4;
+/// Colour of pixels that do not show the object.
+const OUTSIDE: [u8; 3] = [24; 3];
+
+/// Values from -1 to 1 of a crop's pixels as colours.
+fn colors(crop: &Crop, values: &[[f32; 3]]) -> RgbImage {
+    let side = crop.side * ZOOM;
+    Image::from_fn(side, side, |x, y| {
+        let i = (y / ZOOM) * crop.side + x / ZOOM;
+        if crop.mask[i] { values[i].map(|v| (127.5 + 127.5 * v).clamp(0.0, 255.0) as u8) } else { OUTSIDE }
+    })
+}
+
+/// A crop's normals with a grasp.
+fn grasp_on(crop: &Crop, pose: &Pose, opening: f64, gripper: &Gripper) -> Result<RgbImage, MeshError> {
+    let side = crop.side * ZOOM;
+    let drawn = [DrawnGrasp { camera_from_gripper: *pose, opening, color: [60, 220, 80] }];
+    draw_grasps(&colors(crop, &crop.normals), None, &crop.camera.resize(side, side), gripper, &drawn)
 }

@@ -42,7 +42,7 @@ pub use self::postgres::PostgresStore;
 pub use attempt::Attempt;
 pub use crop::{Crop, CropError, CropOptions};
 pub use crop_turn::turn;
-pub use describe::Description;
+pub use describe::{Description, picture_with_nearest};
 pub use experience::{COPIES, Copy, Experience, FeatureExtractor, Stored, region};
 pub use index::{FeatureIndex, Match};
 #[cfg(feature = "sqlite")]

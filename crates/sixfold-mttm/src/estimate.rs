@@ -577,9 +577,13 @@ fn verify_all(
             .zip(&kept)
             .enumerate()
             .map(|(i, (v, p))| {
-                // Both the rendered mesh and the matched template count. In the published form only the mesh does.
-                let power = if options.published { 0.0 } else { TEMPLATE_POWER };
-                let confidence = v.score.ranking() * p.support.clamp(0.0, 1.0).powf(power);
+                let confidence = if options.published {
+                    // Section 5.2.5: S_D S_B S_N of the rendered mesh alone.
+                    v.score.total
+                } else {
+                    // Both the rendered mesh and the matched template count, and how much of the object is visible.
+                    v.score.ranking() * p.support.clamp(0.0, 1.0).powf(TEMPLATE_POWER)
+                };
                 (v.camera_from_object, confidence, v.score, i)
             })
             .collect(),

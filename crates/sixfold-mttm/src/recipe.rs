@@ -187,9 +187,13 @@ impl Recipe for MttmRecipe {
             }
         };
         let default = DepthPoolOptions::for_side(network.side());
-        // As published, objects of which less than half is visible are not used in the training.
-        let visible = if self.network == MttmKind::Paper { 0.5 } else { default.visible };
-        let pool = DepthPoolOptions { visible, seed: self.seed, ..default };
+        // As published, objects of which less than half is visible are not used in the training, and every view has noise.
+        let pool = match self.network {
+            MttmKind::Compact => DepthPoolOptions { seed: self.seed, ..default },
+            MttmKind::Paper => {
+                DepthPoolOptions { visible: 0.5, some_without_noise: false, seed: self.seed, ..default }
+            }
+        };
         let mut card =
             ModelCard::new("", "Multi-task template matching, objects never trained on in depth images");
         card.data = format!(

@@ -10,7 +10,7 @@ use sixfold_nn::training::{Batches, Losses, Plan, Training};
 use crate::loss::{GAMMA, column, cross_loss, distance_loss, mask_loss, pair_loss, triplet_loss};
 use crate::network::{MAP, Network, masked};
 use crate::patch::PLANES;
-use crate::samples::{Batch, DepthPoolOptions, PairBatchOptions, Pool};
+use crate::samples::{Augmentation, Batch, DepthPoolOptions, PairBatchOptions, Pool};
 
 /// Options of the training. All of them affect the result.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -58,7 +58,7 @@ impl MttmTrainingOptions {
                 anchors: 16,
                 without_object: 0,
                 other_objects: 0.5,
-                ..PairBatchOptions::default()
+                augmentation: Augmentation::published(),
             },
             cross: 0.0,
             offset: 0.0,

@@ -217,6 +217,8 @@ fn as_published_masks_come_first_and_poses_from_them() {
         let scene = prepared(&depth);
         let (found, stages) = estimate(&scene, &object, &options);
         assert!(stages.sampled > 20 && stages.regions > 0, "{stages:?}");
+        // Ranked by S_D S_B S_N alone (section 5.2.5).
+        assert!(found.iter().all(|e| e.confidence == e.score.total), "{:?}", found.first().map(|e| e.score));
         let Some(best) = found.first() else { continue };
         overlaps.push(iou(best, &visible, &depth));
         let (t, r) = off(best, &truth);

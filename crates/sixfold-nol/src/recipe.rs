@@ -153,10 +153,12 @@ impl Recipe for NolRecipe {
                 Network::Paper(network.map_err(TrainError::about("encoder"))?)
             }
         };
+        // As published, photographs alone.
+        let procedural = if self.network == NolKind::Paper { 0.0 } else { PROCEDURAL_FRACTION };
         let textures = match &self.backgrounds {
             Some(folder) => Backgrounds::from_folder(folder, &PhotographOptions::default())
                 .map_err(TrainError::about("backgrounds"))?
-                .with_procedural_fraction(PROCEDURAL_FRACTION),
+                .with_procedural_fraction(procedural),
             None => Backgrounds::procedural(),
         };
         let mut card = ModelCard::new("", "Neural Object Learning, new views from few photographs");

@@ -68,7 +68,7 @@ impl NolTrainingOptions {
         let default = Self::default();
         NolTrainingOptions {
             common: TrainingOptions { steps: 350_000, learning_rate: 1e-3, ..default.common },
-            samples: ViewSampleOptions { good_poses: 0.0, ..default.samples },
+            samples: ViewSampleOptions::published(),
             batch: ViewBatchOptions {
                 sides: vec![256],
                 min_sources: 8,

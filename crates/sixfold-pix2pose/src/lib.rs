@@ -10,6 +10,7 @@ pub mod depth;
 pub mod estimate;
 pub mod estimator;
 mod loss;
+pub mod loss_curve;
 pub mod model;
 pub mod networks;
 pub mod object;

@@ -31,6 +31,7 @@ use crate::training::{CompactBatch, CompactTraining, Pix2PoseTrainingOptions};
 use sixfold_data::{
     FrameId, PosedImage, TrainingObject, TrainingSet, background_files, backgrounds_with_images,
 };
+use sixfold_synth::augment::{Backgrounds, PhotographOptions};
 
 /// Which network is trained.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -430,8 +431,7 @@ impl Recipe for Pix2PoseRecipe {
         session: &mut Session<'_>,
     ) -> Result<Option<SampleSource>, TrainError> {
         let Context { objects, real, sizes, .. } = context;
-        let backgrounds = backgrounds_with_images(self.backgrounds.as_deref(), real, objects)
-            .map_err(TrainError::method)?;
+        let backgrounds = self.backgrounds_of(real, objects)?;
         session.note(&format!(
             "making {} objects and {} photographed instances ready",
             objects.len(),
@@ -480,6 +480,20 @@ impl Recipe for Pix2PoseRecipe {
 }
 
 impl Pix2PoseRecipe {
+    /// The backgrounds of the training images; as published only the photographs of the folder, if there is one.
+    fn backgrounds_of(
+        &self,
+        real: &[PosedImage],
+        objects: &[TrainingObject],
+    ) -> Result<Backgrounds, TrainError> {
+        let made = match (self.published, self.backgrounds.as_deref()) {
+            (true, Some(folder)) => Backgrounds::from_folder(folder, &PhotographOptions::default())
+                .map(|photographs| photographs.with_procedural_fraction(0.0)),
+            (_, folder) => backgrounds_with_images(folder, real, objects),
+        };
+        made.map_err(TrainError::method)
+    }
+
     /// The outlier threshold of the object, chosen on images of the first stage in which it is always partly hidden.
     fn outlier_threshold(
         &self,
@@ -488,8 +502,7 @@ impl Pix2PoseRecipe {
         real: &[PosedImage],
         sizes: ImageSizes,
     ) -> Result<f32, TrainError> {
-        let backgrounds = backgrounds_with_images(self.backgrounds.as_deref(), real, &objects)
-            .map_err(TrainError::method)?;
+        let backgrounds = self.backgrounds_of(real, &objects)?;
         let options = SampleOptions { second_stage_fraction: 0.0, ..self.sample_options(sizes) };
         let source = SampleSource::new(objects, real.to_vec(), backgrounds, options);
         Ok(choose(model, 0, &source.map_err(TrainError::method)?, self.seed.wrapping_add(1)))
@@ -629,5 +642,28 @@ fn warn_of_symmetry(object: &TrainingObject, session: &mut Session<'_>) {
             ));
             return;
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use sixfold_geometry::Image;
+    use sixfold_geometry::random::stream;
+
+    #[test]
+    fn published_backgrounds_are_the_photographs_of_the_folder_alone() {
+        let folder = tempfile::tempdir().unwrap();
+        sixfold_io::write_rgb(&folder.path().join("grey.png"), &Image::filled(64, 64, [90; 3])).unwrap();
+        let recipe = Pix2PoseRecipe { backgrounds: Some(folder.path().into()), ..Pix2PoseRecipe::default() };
+        // How many of 60 backgrounds show anything but the photograph.
+        let others = |recipe: &Pix2PoseRecipe| {
+            let backgrounds = recipe.backgrounds_of(&[], &[]).unwrap();
+            let random = &mut stream(1, 2);
+            let grey = |v: &f32| (255.0 * v - 90.0).abs() < 1.0;
+            (0..60).filter(|_| !backgrounds.patch(16, 16, random).data.iter().all(grey)).count()
+        };
+        assert!(others(&recipe) > 0);
+        assert_eq!(others(&Pix2PoseRecipe { published: true, ..recipe }), 0);
     }
 }

@@ -70,6 +70,8 @@ pub struct NewViews<'a> {
     pub backgrounds: Option<&'a Path>,
     /// Also add the photographs, cropped to the object.
     pub with_photographs: bool,
+    /// Whether pixels of a photograph that contradict the others are left out.
+    pub compare_photographs: bool,
 }
 
 /// What was made.
@@ -265,7 +267,11 @@ impl NewViews<'_> {
             .iter()
             .map(|i| SourceView::new(&i.posed, &object.mesh, CROP))
             .collect::<Result<_, _>>()?;
-        let differing = leave_out_what_differs(&mut sources, &object.mesh);
+        let differing = if self.compare_photographs {
+            leave_out_what_differs(&mut sources, &object.mesh)
+        } else {
+            vec![]
+        };
         let maker = ViewMaker::new(&object.mesh, sources, self.weighting, self.per_view)
             .with_context(|| format!("object {}", object.id))?;
         let written = split.write(object, &maker, &|_, _| progress.next(object.id))?;

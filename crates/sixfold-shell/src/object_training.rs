@@ -197,6 +197,7 @@ impl ObjectTraining<'_> {
             grid: self.grid(),
             backgrounds: None,
             with_photographs: true,
+            compare_photographs: true,
         };
         let (summary, mut sheets) = new.make(&folder, images, watch)?;
         sheets.take_failed().iter().for_each(|text| watch.note(&format!("skipped {text}")));

@@ -4,6 +4,7 @@
 use std::fs;
 use std::path::Path;
 
+use sixfold_geometry::RgbImage;
 use sixfold_io::write_mask;
 use sixfold_render::render_depth;
 
@@ -64,6 +65,21 @@ fn experience_is_stored_shown_used_merged_exported_and_forgotten() {
     sixfold(path, "grasp store merge a.db b.db").expect(1);
     sixfold(path, "grasp store show a.db 1 --picture shown.png").expect(0);
     assert!(fs::metadata(path.join("shown.png")).unwrap().len() > 2000);
+    // The object beside its nearest experiences: two are stored; the columns show them as `store show` does.
+    sixfold(path, &format!("{VIEW} --experiences a.db --weights w.safetensors --out near")).expect(0);
+    let near = sixfold_io::read_rgb(&path.join("near/experiences.png")).unwrap();
+    let side = near.height() / 2;
+    assert_eq!(near.width(), 3 * side);
+    let quarter = |image: &RgbImage, left: usize| -> Vec<[u8; 3]> {
+        (0..side * side / 2).map(|i| image[(left + i % side, i / side)]).collect()
+    };
+    let columns = [1, 2].map(|column| quarter(&near, column * side));
+    for id in [1, 2] {
+        sixfold(path, &format!("grasp store show a.db {id} --picture shown.png")).expect(0);
+        let shown = quarter(&sixfold_io::read_rgb(&path.join("shown.png")).unwrap(), 0);
+        assert!(columns.contains(&shown), "experience {id} is not in the picture");
+    }
+    assert!(!path.join("out/experiences.png").exists(), "that was without experiences");
     sixfold(path, "grasp store export a.db --out files").expect(0);
     let text = fs::read_to_string(path.join("files/000001.json")).unwrap();
     let exported: serde_json::Value = serde_json::from_str(&text).unwrap();

@@ -3,6 +3,7 @@
 mod auto;
 mod dgcm;
 mod kept;
+mod loss_curve;
 mod mttm;
 mod nol;
 mod pix2pose;
@@ -33,6 +34,9 @@ pub(crate) enum ReproduceCommand {
         sixfold reproduce pix2pose --dataset lmo --frames frames.json --weights model.safetensors --published lmo/published/cnos-fastsam-megapose_lmo-test.csv --out out/reproduce\n\n\
         Finished rows are kept. After a stop, the same command resumes.")]
     Pix2pose(Box<pix2pose::ReproducePix2PoseArguments>),
+    /// Plot the losses of symmetric objects against their rotation: figure 3.3
+    #[command(after_help = loss_curve::AFTER_HELP)]
+    LossCurve(loss_curve::LossCurveArguments),
     /// Measure masks and poses of template matching per object, with ablations, point pair features and times
     #[command(after_help = "Example:\n  \
         sixfold reproduce mttm --dataset lmo-simulated --out out/reproduce-mttm\n\n\
@@ -58,6 +62,7 @@ pub(crate) fn run(a: &ReproduceArguments) -> Result<Outcome> {
     match &a.command {
         ReproduceCommand::Auto(arguments) => auto::run(arguments, &a.json),
         ReproduceCommand::Pix2pose(arguments) => pix2pose::run(arguments, &a.json),
+        ReproduceCommand::LossCurve(arguments) => loss_curve::run(arguments, &a.json),
         ReproduceCommand::Mttm(arguments) => mttm::run(arguments, &a.json),
         ReproduceCommand::Nol(arguments) => nol::run(arguments, &a.json),
         ReproduceCommand::Teach(arguments) => teach::run(arguments, &a.json),

@@ -19,6 +19,8 @@ pub struct Augmentation {
     pub depth: f64,
     /// Probability that a patch and its templates are rotated by 90, 180 or 270 degrees.
     pub turned: f64,
+    /// Whether half of the patches are mirrored with their templates.
+    pub mirrored: bool,
     /// Probability of an occluder in front.
     pub hidden: f64,
     /// Probability of a rectangle without measurements.
@@ -27,7 +29,21 @@ pub struct Augmentation {
 
 impl Default for Augmentation {
     fn default() -> Self {
-        Augmentation { shift: 0.12, depth: 0.1, turned: 0.3, hidden: 0.25, lost: 0.25 }
+        Augmentation { shift: 0.12, depth: 0.1, turned: 0.3, mirrored: true, hidden: 0.25, lost: 0.25 }
+    }
+}
+
+impl Augmentation {
+    /// The dissertation's: only a shift of the centre across the region (section 5.3.1; its size is not given).
+    pub fn published() -> Self {
+        Augmentation {
+            depth: 0.0,
+            turned: 0.0,
+            mirrored: false,
+            hidden: 0.0,
+            lost: 0.0,
+            ..Augmentation::default()
+        }
     }
 }
 
@@ -253,7 +269,7 @@ impl Change {
             let depth = -0.3 - 0.6 * random.random::<f32>();
             rectangles.push((area, Some([normal[0], normal[1], normal[2], depth])));
         }
-        let quarter = Quarter { mirrored: random.random(), turns };
+        let quarter = Quarter { mirrored: random.random::<bool>() && how.mirrored, turns };
         Change { quarter, first, shift: [across(0), across(1), along], rectangles }
     }
 
@@ -311,6 +327,18 @@ impl Change {
 mod tests {
     use super::*;
     use sixfold_geometry::nalgebra::{Quaternion, UnitQuaternion, Vector3};
+
+    #[test]
+    fn as_published_regions_are_shifted_and_nothing_else() {
+        let random = &mut stream(3, 0);
+        let draw = |how: &Augmentation, random: &mut _| Change::draw(how, 56, 80, random);
+        let all: Vec<Change> = (0..100).map(|_| draw(&Augmentation::published(), random)).collect();
+        let unchanged = Quarter { mirrored: false, turns: 0 };
+        assert!(all.iter().all(|c| c.quarter == unchanged && c.rectangles.is_empty() && c.shift[2] == 0.0));
+        assert!(all.iter().any(|c| c.shift[0] > 0.05) && all.iter().any(|c| c.shift[1] < -0.05));
+        let ours: Vec<Change> = (0..100).map(|_| draw(&Augmentation::default(), random)).collect();
+        assert!(ours.iter().any(|c| c.quarter.mirrored) && ours.iter().any(|c| !c.rectangles.is_empty()));
+    }
 
     #[test]
     fn directions_rotations_and_pixels_go_the_same_way() {

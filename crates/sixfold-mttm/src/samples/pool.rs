@@ -31,6 +31,8 @@ pub struct DepthPoolOptions {
     pub roll: f64,
     /// Smallest visible fraction of an object; others are left out (dissertation: half).
     pub visible: f64,
+    /// Whether a tenth of the views has no noise of a sensor.
+    pub some_without_noise: bool,
     /// Regions without an object from each view.
     pub without_object: usize,
     /// How regions are cut out.
@@ -48,6 +50,7 @@ impl DepthPoolOptions {
             elevation: (20f64.to_radians(), 80f64.to_radians()),
             roll: 20f64.to_radians(),
             visible: 0.35,
+            some_without_noise: true,
             without_object: 4,
             anchors: AnchorOptions::for_side(side),
             seed: 0,
@@ -129,8 +132,8 @@ fn see(
     let sensor = match random.random_range(0..10u32) {
         0..2 => Some(DepthSensor::kinect()),
         2..7 => Some(DepthSensor::xtion()),
-        7..9 => Some(DepthSensor::realsense()),
-        _ => None,
+        9 if options.some_without_noise => None,
+        _ => Some(DepthSensor::realsense()),
     };
     let table_size = 0.5 + 1.5 * random.random::<f64>();
     let Some(table) = table(table_size) else { return vec![] };

@@ -9,8 +9,8 @@ mod error;
 mod options;
 pub(crate) mod second_stage;
 mod source;
-mod symmetry;
-mod targets;
+pub(crate) mod symmetry;
+pub(crate) mod targets;
 #[cfg(test)]
 mod tests;
 pub(crate) mod window;

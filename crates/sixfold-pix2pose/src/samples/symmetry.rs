@@ -13,7 +13,7 @@ use sixfold_geometry::{Pose, Vec3};
 use sixfold_mesh::{ContinuousSymmetry, ModelInfo};
 
 /// The pose whose targets are used in the training; with `limits`, one of those that are equivalent under the discrete symmetries.
-pub(super) fn canonical(pose: &Pose, info: &ModelInfo, limits: bool) -> Pose {
+pub(crate) fn canonical(pose: &Pose, info: &ModelInfo, limits: bool) -> Pose {
     let pose = if limits { within_limits(pose, info) } else { *pose };
     info.symmetries_continuous.iter().fold(pose, |pose, symmetry| facing_camera(&pose, symmetry))
 }

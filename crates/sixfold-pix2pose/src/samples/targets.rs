@@ -6,7 +6,7 @@ use sixfold_render::{BoundingBoxScale, RenderOptions, SceneObject, VisibilityBuf
 use sixfold_synth::augment::Coverage;
 
 /// Coordinates (3 planes, normalised, 0 outside) and silhouette (0 or 1) of the whole object.
-pub(super) fn targets(
+pub(crate) fn targets(
     mesh: &Mesh,
     scale: &BoundingBoxScale,
     camera: &Camera,

@@ -156,6 +156,47 @@ pub fn picture(
     Ok(out)
 }
 
+/// Number of the nearest experiences in [`nearest_picture`], as in the dissertation.
+#[cfg(feature = "experience")]
+const NEAREST: usize = 3;
+
+/// The object with its best grasp beside the experiences nearest to it (dissertation, figure 6.8): normals above, VD-NOC below. The
+/// labels are the objects of the experiences and the distances of the features.
+///
+/// # Errors
+/// When the store cannot be read, or for a gripper that has no mesh.
+#[cfg(feature = "experience")]
+pub fn nearest_picture(
+    grasps: &sixfold_dgcm::transfer::RankedGrasps,
+    memory: &mut sixfold_dgcm::transfer::Memory,
+    gripper: &Gripper,
+) -> Result<RgbImage> {
+    let mut nearest = vec![];
+    for found in grasps.found.nearest.iter().take(NEAREST) {
+        if let Some(stored) = memory.get(found.experience)? {
+            nearest.push((stored, found.distance));
+        }
+    }
+    let grasp = grasps.ranked.first().map(|r| (&r.grasp.camera_from_gripper, r.grasp.opening, gripper));
+    let experiences: Vec<_> = nearest.iter().map(|(stored, _)| &stored.experience).collect();
+    let mut out = sixfold_experience::picture_with_nearest(&grasps.found.crop, grasp, &experiences)?;
+    let side = out.height() as f64 / 2.0;
+    let texts = nearest.iter().map(|(stored, distance)| caption(&stored.experience.object, *distance));
+    let label = |(column, text): (usize, String)| {
+        let middle = (column as f64 + 0.5) * side;
+        Label {
+            text,
+            of: [middle, side, middle, side],
+            color: if column == 0 { BEST } else { OTHER },
+            is_sure: true,
+        }
+    };
+    let labels: Vec<Label> =
+        std::iter::once("this object".to_owned()).chain(texts).enumerate().map(label).collect();
+    draw_labels(&mut out, &labels);
+    Ok(out)
+}
+
 /// Prints the grasps, one a line.
 pub fn print_table(grasps: &[Proposed]) {
     println!(

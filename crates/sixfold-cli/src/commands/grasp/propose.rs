@@ -8,6 +8,7 @@ use clap::Args;
 use serde::Serialize;
 #[cfg(feature = "experience")]
 use sixfold_dgcm::transfer::{grasps_as_published, grasps_from_experience};
+use sixfold_geometry::RgbImage;
 use sixfold_grasp::AntipodalOptions;
 #[cfg(feature = "experience")]
 use sixfold_grasp::{GraspView, Gripper};
@@ -18,9 +19,9 @@ use sixfold_shell::grasp::experience::{self, NetworkArguments, store_place};
 use sixfold_shell::grasp::gripper::gripper;
 use sixfold_shell::grasp::input::{self, Input, InputArguments};
 use sixfold_shell::grasp::planner::{Planner, PlannerArguments};
-#[cfg(feature = "experience")]
-use sixfold_shell::grasp::proposals::of_both;
 use sixfold_shell::grasp::proposals::{Proposed, Table, of_planner, picture, print_table};
+#[cfg(feature = "experience")]
+use sixfold_shell::grasp::proposals::{nearest_picture, of_both};
 use sixfold_shell::output::{JsonArguments, report, write_atomically};
 use sixfold_shell::pictures::Pictures;
 use sixfold_shell::ranges::count;
@@ -59,7 +60,7 @@ pub(crate) struct ProposeArguments {
     /// Use only the visible surface: assume nothing about the object's far side
     #[arg(long)]
     pub seen_only: bool,
-    /// Folder for grasps.json and overlay.png
+    /// Folder for grasps.json, overlay.png and, with --experiences, experiences.png: the nearest of them
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
     /// Seed of all random numbers
@@ -85,6 +86,8 @@ pub(super) fn run(a: &ProposeArguments) -> Result<Outcome> {
     let planner = Planner::new(&a.planner)?;
     #[cfg(feature = "experience")]
     check_combination(a, &planner)?;
+    #[cfg_attr(not(feature = "experience"), allow(unused_mut))]
+    let mut nearest: Option<RgbImage> = None;
     let mut folder = a.out.as_deref().map(OutputFolder::take).transpose()?;
     let files = folder.as_mut().map(|f| f.files(&["overlay.png", "grasps.json"])).transpose()?;
     let Input { depth, camera, rgb, view, began } = input::read(&a.input, a.rgb.as_deref(), a.seed)?;
@@ -97,7 +100,7 @@ pub(super) fn run(a: &ProposeArguments) -> Result<Outcome> {
             let alone = || anyhow::Ok(of_planner(&planner, &planner.grasps(view, &gripper, &options)?));
             #[cfg(feature = "experience")]
             let found = match &a.experiences {
-                Some(_) => with_experience(a, view, &gripper, &planner, &options)?,
+                Some(_) => with_experience(a, view, &gripper, &planner, &options, &mut nearest)?,
                 None => alone()?,
             };
             #[cfg(not(feature = "experience"))]
@@ -123,6 +126,9 @@ pub(super) fn run(a: &ProposeArguments) -> Result<Outcome> {
     let mut pictures = Pictures::of(folder);
     if whole.overlay.is_some() {
         pictures.write("overlay.png", &picture(rgb, &depth, &camera, &gripper, &whole.grasps)?);
+    }
+    if let Some(image) = nearest {
+        pictures.write("experiences.png", &image);
     }
     Ok(pictures.outcome(if whole.grasps.is_empty() { Outcome::NothingFound } else { Outcome::Found }))
 }
@@ -180,6 +186,7 @@ fn with_experience(
     gripper: &Gripper,
     planner: &Planner,
     options: &AntipodalOptions,
+    picture: &mut Option<RgbImage>,
 ) -> Result<Vec<Proposed>> {
     let Some(place) = &a.experiences else { return Ok(vec![]) };
     let network = experience::model(&a.network)?;
@@ -198,6 +205,9 @@ fn with_experience(
     if grasps.found.nearest.is_empty() {
         let wanted = part.map_or(String::new(), |part| format!(" on a part named {part}"));
         eprintln!("note: {place} holds no experience{wanted} that this network can use");
+    }
+    if a.out.is_some() {
+        *picture = Some(nearest_picture(&grasps, &mut memory, gripper)?);
     }
     Ok(of_both(planner, &grasps))
 }

@@ -281,7 +281,7 @@ impl SynthesizeArguments {
             "rough": self.rough, "disturb": self.disturb, "step": self.step, "elevation": self.elevation,
             "rotations": self.rotations(), "select": format!("{:?}", self.select()),
             "refinement": format!("{:?}", self.refinement_kind()), "size": self.size, "backgrounds": self.backgrounds,
-            "with_photographs": self.with_photographs, "seed": self.seed,
+            "with_photographs": self.with_photographs, "preset": self.preset.is_some(), "seed": self.seed,
         })
     }
 }

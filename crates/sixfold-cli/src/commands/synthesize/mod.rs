@@ -49,6 +49,7 @@ pub(crate) fn run(a: &SynthesizeArguments) -> Result<Outcome> {
         grid: a.grid(),
         backgrounds: a.backgrounds.as_deref(),
         with_photographs: a.with_photographs,
+        compare_photographs: a.preset.is_none(),
     };
     let (mut summary, sheets) = new.make(&folder, images, &Terminal::default())?;
     summary.seconds = start.elapsed().as_secs_f64();

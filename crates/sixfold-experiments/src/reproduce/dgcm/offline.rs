@@ -14,7 +14,7 @@ use rand::RngExt;
 use rand::seq::SliceRandom;
 use serde::{Deserialize, Serialize};
 use sixfold_dgcm::model::DgcmModel;
-use sixfold_dgcm::transfer::{Memory, ProposeOptions, propose, rank};
+use sixfold_dgcm::transfer::{Memory, ProposeOptions, propose, rank, rank_experience_as_published};
 use sixfold_experience::{Crop, Experience, SqliteStore};
 use sixfold_geometry::random::stream;
 use sixfold_geometry::{Pose, Vec3};
@@ -299,7 +299,12 @@ impl Offline<'_> {
         };
         let options = ProposeOptions { only: Some(only), ..form };
         let found = propose(&fitter, self.network, memory, &options)?;
-        Ok(rank(&[], &found.proposals, &ClusterOptions::default()).first().map(|best| {
+        let clusters = ClusterOptions::default();
+        let ranked = match self.form {
+            Form::Ours | Form::Network => rank(&[], &found.proposals, &clusters),
+            Form::Published => rank_experience_as_published(&found.proposals, &clusters),
+        };
+        Ok(ranked.first().map(|best| {
             let wanted = &test.wanted;
             let distance = best.grasp.camera_from_gripper.distance_to(&wanted.camera_from_gripper);
             (distance, best.grasp.approach().angle(&wanted.approach()))
