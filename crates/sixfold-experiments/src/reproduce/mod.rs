@@ -4,6 +4,7 @@ mod auto;
 mod dgcm;
 mod kept;
 mod loss_curve;
+mod mesh_errors;
 mod mttm;
 mod nol;
 mod pix2pose;

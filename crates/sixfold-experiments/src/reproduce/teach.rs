@@ -24,6 +24,7 @@ use sixfold_shell::output::{JsonArguments, report, write_atomically};
 use sixfold_shell::progress::{Progress, check_interrupt};
 use sixfold_teach::simulation::{SimulatedCapture, SimulationOptions, ground_of, patterned};
 
+use super::mesh_errors;
 use super::teach_photographs::{
     board_from_world, errors, marked_length, teaching, write_depth_images, write_photographs,
 };
@@ -270,7 +271,9 @@ fn measured(
     let errors = errors(&teaching, &capture, &board_from_world)?;
     let there = mesh.transformed(&capture.board_from_object);
     let seen = seen_points(&there, &capture, &options.camera);
-    let [mesh_mm, truth_mm] = distances(&taught.transformed(&board_from_taught), &there, &seen);
+    let placed = taught.transformed(&board_from_taught);
+    let [mesh_mm, truth_mm] = distances(&placed, &there, &seen);
+    sixfold_io::write_rgb(&files.join("errors.png"), &mesh_errors::picture(&placed, &there)?)?;
     let taught_from_true = compose(&board_from_taught.inverse(), &capture.board_from_object);
     let scene = NewScenes { mesh, others, ground, seed: a.seed };
     let mut info = ModelInfo::of_mesh(&taught);

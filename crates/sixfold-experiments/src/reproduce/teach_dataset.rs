@@ -23,6 +23,7 @@ use sixfold_shell::ranges::in_range;
 use sixfold_teach::{MAX_PHOTOGRAPHS, SalientSegmenter, ShapeOptions, Teaching};
 use sixfold_views::estimator::ViewsEstimator;
 
+use super::mesh_errors;
 use super::teach::{compose, mean_millimetres};
 
 pub(super) const AFTER_HELP: &str = "Example:\n  \
@@ -307,7 +308,9 @@ fn measured(
     let facts = teaching.shape().context("no mesh was made")?;
     let rows = facts.board_from_object;
     let true_from_taught = Pose::from_translation(Vec3::new(rows[0][3], rows[1][3], rows[2][3]));
-    let [mesh_mm, truth_mm] = distances(&taught.transformed(&true_from_taught), mesh, &used);
+    let placed = taught.transformed(&true_from_taught);
+    let [mesh_mm, truth_mm] = distances(&placed, mesh, &used);
+    sixfold_io::write_rgb(&folder.join("errors.png"), &mesh_errors::picture(&placed, mesh)?)?;
     let visible = |s: &&Seen| s.info.visib_fract >= VISIBLE_TO_FIND;
     let others: Vec<&Seen> = (0..seen.len())
         .filter(|i| !numbers.contains(i))

@@ -57,7 +57,7 @@ impl Method {
 /// Which form of a method of the dissertation runs.
 #[derive(Debug, Args)]
 pub(super) struct PresetArguments {
-    /// Run the method as the dissertation describes it (docs/published.md lists what still differs)
+    /// Run the method as the dissertation describes it (docs/coverage.md lists what still differs)
     #[arg(long, value_name = "NAME", value_enum)]
     preset: Option<Preset>,
 }

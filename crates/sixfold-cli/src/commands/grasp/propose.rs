@@ -53,7 +53,7 @@ pub(crate) struct ProposeArguments {
     #[cfg(feature = "experience")]
     #[arg(long, value_name = "NAME", requires = "experiences")]
     pub part: Option<String>,
-    /// Propose grasps as the dissertation describes it (docs/published.md lists what still differs)
+    /// Propose grasps as the dissertation describes it (docs/coverage.md lists what still differs)
     #[cfg(feature = "experience")]
     #[arg(long, value_name = "NAME", value_enum, requires = "experiences")]
     pub preset: Option<Preset>,

@@ -91,7 +91,7 @@ pub(crate) struct SynthesizeArguments {
     /// Name of the new dataset's split
     #[arg(long, value_name = "NAME", default_value = "train_nol", value_parser = ranges::folder_name)]
     pub new_split: String,
-    /// Make views as the dissertation describes it: --select pose, --refinement published, --rotations 7 (docs/published.md)
+    /// Make views as the dissertation describes it: --select pose, --refinement published, --rotations 7 (docs/coverage.md)
     #[arg(long, value_name = "NAME", value_enum)]
     pub preset: Option<Preset>,
     /// How photographs are chosen (default: surface; with --preset published: pose)

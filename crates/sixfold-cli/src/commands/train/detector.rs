@@ -32,7 +32,7 @@ pub(crate) struct TrainDetectorArguments {
     /// Folder for checkpoints, learning curves and the finished model
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// Train as published, as far as implemented (docs/published.md): ResNet-50, only objects cut out of photographs
+    /// Train as published, as far as implemented (docs/coverage.md): ResNet-50, only objects cut out of photographs
     #[arg(long, value_parser = choices::<Preset>())]
     pub preset: Option<Preset>,
     #[arg(long, value_parser = choices::<DetectorKind>(), help = presets("Network to train", default().network.name(), published().network.name()))]

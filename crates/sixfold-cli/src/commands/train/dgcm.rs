@@ -35,7 +35,7 @@ fn pairs_help() -> String {
 
 #[derive(Debug, Args)]
 pub(crate) struct TrainDgcmArguments {
-    /// Train as published (docs/published.md): the dissertation's network, pairs, rate and views
+    /// Train as published (docs/coverage.md): the dissertation's network, pairs, rate and views
     #[arg(long, value_parser = choices::<Preset>())]
     pub preset: Option<Preset>,
     #[arg(long, value_parser = choices::<DgcmKind>(), help = presets("Network", default().network.name(), published().network.name()))]

@@ -25,7 +25,7 @@ fn help(what: &str, of: impl Fn(MttmKind) -> String) -> String {
 
 #[derive(Debug, Args)]
 pub(crate) struct TrainMttmArguments {
-    /// Train as published (docs/published.md): the dissertation's network, losses, negative templates and number of scenes
+    /// Train as published (docs/coverage.md): the dissertation's network, losses, negative templates and number of scenes
     #[arg(long, value_parser = choices::<Preset>())]
     pub preset: Option<Preset>,
     #[arg(long, value_parser = choices::<MttmKind>(), help = presets("Network", default().network.name(), MttmRecipe::published().network.name()))]

@@ -26,7 +26,7 @@ fn help(what: &str, of: impl Fn(NolKind) -> String) -> String {
 
 #[derive(Debug, Args)]
 pub(crate) struct TrainNolArguments {
-    /// Train as published (docs/published.md): the dissertation's network and losses, eight sources, all poses rough
+    /// Train as published (docs/coverage.md): the dissertation's network and losses, eight sources, all poses rough
     #[arg(long, value_parser = choices::<Preset>())]
     pub preset: Option<Preset>,
     #[arg(long, value_parser = choices::<NolKind>(), help = presets("Network", default().network.name(), NolRecipe::published().network.name()))]

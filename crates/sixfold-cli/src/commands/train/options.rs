@@ -40,7 +40,7 @@ impl Choice for Preset {
     }
 
     fn help(self) -> &'static str {
-        "As in the dissertation; other options still count (docs/published.md)"
+        "As in the dissertation; other options still count (docs/coverage.md)"
     }
 }
 

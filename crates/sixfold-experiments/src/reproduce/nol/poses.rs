@@ -19,8 +19,8 @@ use sixfold_shell::output::pose_rows;
 
 /// Variants of refinement: key and title.
 pub(super) const WAYS: [(&str, &str); 6] = [
-    ("printed", "printed rule, the network's rendering"),
-    ("printed-average", "printed rule, mean of the colours"),
+    ("printed", "published rule, the network's rendering"),
+    ("printed-average", "published rule, mean of the colours"),
     ("colours", "ours, colours only"),
     ("outline", "ours, outline only"),
     ("both", "ours, both"),
