@@ -64,7 +64,7 @@ mod tests {
             let corners = corners.iter().map(|&(x, y, z)| Vec3::new(x, y, z)).collect();
             Mesh::new(corners, vec![[0, 1, 2], [0, 2, 3]]).unwrap()
         };
-        let is_red = |p: &[u8; 3]| p[0] > 60 && p[0] > 2 * p[1].max(p[2]);
+        let is_red = |p: &[u8; 3]| p[0] > 60 && p[0] / 2 > p[1].max(p[2]);
         let reds = |found: &Mesh| {
             let picture = picture(found, &square(0.0)).unwrap();
             let views = picture.height() - SCALE;
