@@ -5,7 +5,8 @@
     python3 docs/tools/links.py HTML       the same for a built book (mdbook build docs -d HTML)
 
 Rules: a relative link names a file of the repository, a `#part` a heading of it; every page of the book stands in SUMMARY.md, and
-links pages and images of the book alone, because the site has nothing else. Links to other sites are not followed.
+links pages and images of the book alone, because the site has nothing else. Links to other sites are not followed. The files that
+docs/coverage.md names exist.
 """
 
 import re
@@ -100,7 +101,22 @@ def check_texts():
     for path in every:
         if BOOK in path.parents and path not in pages:
             wrong.append(f"{path.relative_to(ROOT)}: is not in docs/SUMMARY.md")
+    wrong += check_coverage()
     return wrong, f"{links} links in {len(every)} texts"
+
+
+def check_coverage():
+    """The files that docs/coverage.md names in its last column: `x/y.rs` is crates/sixfold-x/y.rs."""
+    wrong, rows = [], 0
+    for number, line in enumerate((BOOK / "coverage.md").read_text().split("\n"), 1):
+        cells = line.strip("|").split(" | ")
+        if not line.startswith("| ") or len(cells) < 3:
+            continue
+        rows += 1
+        for name in re.findall(r"`([a-z0-9-]+/[^`]+)`", cells[-1]):
+            if not (ROOT / "crates" / f"sixfold-{name}").exists():
+                wrong.append(f"docs/coverage.md:{number}: {name}: there is no such file in crates")
+    return wrong if rows > 100 else [*wrong, f"docs/coverage.md: only {rows} rows were read"]
 
 
 class Page(HTMLParser):

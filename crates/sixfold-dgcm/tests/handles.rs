@@ -104,6 +104,24 @@ fn as_published_the_network_alone_transfers_to_a_fixed_distance() {
         assert!((reach + 0.02).abs() < 1e-6, "{reach}");
         assert!((p.score - (-p.from.distance).exp()).abs() < 1e-12);
     }
+    // The mug moved by a tenth of a radian, and the grasps with it: the same approach direction, on the same axis.
+    let moved = now.camera_from_object * taught.camera_from_object.inverse();
+    let errors: Vec<(f64, f64)> = found
+        .proposals
+        .iter()
+        .map(|p| {
+            let wanted = &wide[usize::try_from(p.from.experience).unwrap() - 1];
+            let (approach, target) =
+                (moved.transform_direction(&wanted.approach()), moved * wanted.camera_from_gripper);
+            let off = p.grasp.camera_from_gripper.translation() - target.translation();
+            let aside = off - approach * off.dot(&approach);
+            (p.grasp.approach().angle(&approach).to_degrees(), aside.norm())
+        })
+        .collect();
+    println!("{errors:.3?}");
+    // The four nearest are the experiences themselves; behind them come their copies, rotated in the image plane.
+    assert!(errors.len() >= 4, "{errors:.3?}");
+    assert!(errors[..4].iter().all(|(degrees, aside)| *degrees < 15.0 && *aside < 0.01), "{errors:.3?}");
     // Ours adds other hypotheses to the same experiences.
     let ours = propose(&fitter, &model, &mut memory, &ProposeOptions::default()).unwrap();
     assert!(ours.proposals.iter().any(|p| p.hypothesis != AlignmentHypothesis::Scaled));

@@ -147,6 +147,8 @@ const AROUND_MASKED: usize = 160;
 const AROUND_REGIONS: usize = 40;
 const AROUND_HYPOTHESES: usize = 20;
 const AROUND_NETWORK_HYPOTHESES: usize = 12;
+/// Diameter between those of duck (0.109 m) and holepuncher (0.145 m) of LineMOD, metres.
+const SMALL: f64 = 0.12;
 /// Hypotheses that are refined and verified as published (section 5.3.3).
 const PUBLISHED_VERIFIED: usize = 15;
 
@@ -161,6 +163,21 @@ impl MttmOptions {
             verified: PUBLISHED_VERIFIED,
             verification: VerificationOptions { occluders_have_edges: false, ..default.verification },
             ..default
+        }
+    }
+
+    /// Largest distance in depth at which a pixel agrees, metres; as published 10 mm, and 5 mm for small objects (section 5.3.1:
+    /// ape and duck, the two smallest).
+    fn depth_threshold(&self, diameter: f64) -> f64 {
+        match self.verification.depth_threshold {
+            None if self.published => {
+                if diameter < SMALL {
+                    0.005
+                } else {
+                    0.01
+                }
+            }
+            _ => self.verification.threshold_for(diameter),
         }
     }
 
@@ -457,7 +474,7 @@ pub(crate) fn place_at(
     if options.align {
         pose = align(scene, &surface.sparse, &pose, object.matcher.tolerance());
     }
-    let threshold = options.verification.threshold_for(object.templates.diameter);
+    let threshold = options.depth_threshold(object.templates.diameter);
     let score = judge(scene, surface, &pose, threshold, &options.verification);
     let support = score.ranking() * trust;
     Placed { template, camera_from_view: pose, score, support, mask: None }
@@ -563,7 +580,7 @@ fn verify_all(
     options: &MttmOptions,
 ) -> Vec<MttmEstimate> {
     let templates = &object.templates;
-    let threshold = options.verification.threshold_for(templates.diameter);
+    let threshold = options.depth_threshold(templates.diameter);
     let most = options.verified.max(VERIFIED_OF_INSTANCE * options.max_instances);
     let kept: Vec<&Placed> = hypotheses.iter().take(most).collect();
     let pose_of = |p: &Placed| p.camera_from_view * templates.templates[p.template].view_from_object;
@@ -637,6 +654,9 @@ mod tests {
         assert_eq!(default.for_templates(&templates(ViewCoverage::Around, Source::Depth)), default);
         let published = MttmOptions::published();
         assert_eq!(published.for_templates(&templates(ViewCoverage::Around, Source::Mesh)), published);
+        assert_eq!([0.109, 0.145, 0.26].map(|d| published.depth_threshold(d)), [0.005, 0.01, 0.01]);
+        let ours = [0.08, 0.145, 0.26].map(|d| MttmOptions::default().depth_threshold(d));
+        assert!(ours.iter().zip([0.005, 0.00725, 0.01]).all(|(a, b)| (a - b).abs() < 1e-9), "{ours:?}");
     }
 
     #[test]

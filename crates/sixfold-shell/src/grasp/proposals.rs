@@ -171,9 +171,14 @@ pub fn nearest_picture(
     memory: &mut sixfold_dgcm::transfer::Memory,
     gripper: &Gripper,
 ) -> Result<RgbImage> {
-    let mut nearest = vec![];
-    for found in grasps.found.nearest.iter().take(NEAREST) {
-        if let Some(stored) = memory.get(found.experience)? {
+    let mut nearest: Vec<(std::sync::Arc<sixfold_experience::Stored>, f64)> = vec![];
+    for found in &grasps.found.nearest {
+        // Its copies, rotated in the image plane, are further away.
+        let is_copy = nearest.iter().any(|(shown, _)| shown.id == found.experience);
+        if nearest.len() < NEAREST
+            && !is_copy
+            && let Some(stored) = memory.get(found.experience)?
+        {
             nearest.push((stored, found.distance));
         }
     }
