@@ -124,6 +124,25 @@ fn theta_re_is_in_pixels_of_the_image() {
     assert!(inliers(Reprojection::NetworkPixels(4.5)) > all - moved / 4);
 }
 
+/// The author's code allows 5 pixels.
+#[test]
+fn plain_pnp_counts_pixels_that_are_four_pixels_off() {
+    let exact = prediction(&truth());
+    let mut p = exact.clone();
+    let mut moved = 0;
+    for i in ball(&exact).into_iter().step_by(4).filter(|i| exact.visible[i + 2] > 0.5) {
+        p.coordinates[i] = exact.coordinates[i + 2];
+        moved += 1;
+    }
+    let all = ball(&p).len();
+    let inliers = |plain_pnp| {
+        let quirks = Quirks { plain_pnp, ..Quirks::default() };
+        candidate(&p, 0.2, &Pix2PoseOptions { quirks, ..Pix2PoseOptions::published() }).hypothesis.inliers
+    };
+    assert_eq!(inliers(false), all - moved);
+    assert!(inliers(true) > all - moved / 2, "{} of {all}, {moved} moved", inliers(true));
+}
+
 #[test]
 fn the_candidate_with_most_inliers_wins() {
     let (camera, object) = (camera(), entry());

@@ -26,8 +26,8 @@ use sixfold_shell::grasp::object_list::{Named, ObjectsArguments, PartBox, file_n
 use sixfold_shell::grasp::trial::{Hardness, PhysicsArguments, hardness};
 use sixfold_shell::output::{JsonArguments, report, write_atomically};
 
-/// Values of `--figure`: figure 6.7 in all forms, by the network alone, and as published.
-const TRANSFER: [&str; 3] = ["6.7", "6.7-network", "6.7-published"];
+/// Values of `--figure`: figure 6.7 in all forms, by the network alone, and as published; figures 6.10 to 6.12; figure 6.13.
+const FIGURES: [&str; 5] = ["6.7", "6.7-network", "6.7-published", "6.10", "6.13"];
 /// Largest feature distance at which experience proposes a grasp (dissertation, section 6.3.2).
 const NEAR: f64 = 0.9;
 /// Runs of learning from an empty store, each with its own seed.
@@ -50,9 +50,9 @@ pub(crate) struct ReproduceDgcmArguments {
     /// Few scenes and views, for a quick check
     #[arg(long)]
     pub quick: bool,
-    /// Measure only this figure of the dissertation, the errors of transferred grasps: in all forms, by the network's
-    /// hypotheses alone, or as published
-    #[arg(long, value_name = "FIGURE", value_parser = TRANSFER)]
+    /// Measure only this figure of the dissertation: the errors of transferred grasps in all forms (6.7), by the network's
+    /// hypotheses alone or as published; learning from an empty store (6.10, also 6.11 and 6.12); handles (6.13)
+    #[arg(long, value_name = "FIGURE", value_parser = FIGURES)]
     pub figure: Option<String>,
     #[command(flatten)]
     pub network: NetworkArguments,
@@ -159,9 +159,29 @@ impl Context {
         Ok(Context { setting, network, objects, parts, instances })
     }
 
+    /// Figure 6.13: grasps on handles.
+    fn handles(&self, a: &ReproduceDgcmArguments) -> Result<Vec<handles::Row>> {
+        let handled = a.out.join("handles").join("experience.db");
+        learn::learn(&LearnArguments {
+            families: vec!["mug".to_owned(), "drill".to_owned()],
+            members: if a.quick { 3 } else { 12 },
+            // The question is where the grasp is, not whether this hand could lift the object with it: the easy setting gives
+            // more experience.
+            hard: false,
+            tries: 10,
+            part: Some("handle".to_owned()),
+            near: 0.0,
+            ..a.learning("handles/learn", &handled, 4, vec![])
+        })?;
+        let Context { setting, network, objects, parts, .. } = self;
+        let views = if a.quick { 2 } else { 10 };
+        let handles = Handles { objects, parts, network, setting, views, seed: a.seed };
+        handles.run(&mut memory(&StorePlace::File(handled), network)?, &a.out.join("handles"))
+    }
+
     /// Figure 6.7 in both forms.
     fn transfer(&self, a: &ReproduceDgcmArguments) -> Result<Transfer> {
-        let wanted = |form| a.figure.as_deref().is_none_or(|f| f == TRANSFER[0] || f == TRANSFER[form]);
+        let wanted = |form| a.figure.as_deref().is_none_or(|f| f == FIGURES[0] || f == FIGURES[form]);
         let size = if a.quick {
             Size { views: 1, rounds: 1, stretched: 2 }
         } else {
@@ -197,18 +217,26 @@ impl Context {
 }
 
 pub(crate) fn run(a: &ReproduceDgcmArguments, json: &JsonArguments) -> Result<Outcome> {
-    if a.figure.is_some() {
+    if let Some(figure) = a.figure.as_deref() {
         let context = Context::of(a)?;
-        let transfer = context.transfer(a)?;
-        let mut text = String::new();
-        transfer.add_markdown(&mut text);
-        transfer.draw(&a.out, &context.instances)?;
-        write_atomically(&a.out.join("transfer.json"), serde_json::to_string_pretty(&transfer)?.as_bytes())?;
-        report(json, &transfer, || {
-            println!("{text}");
-            println!("transfer.json is in {}", a.out.display());
-        })?;
-        return Ok(Outcome::Found);
+        return match figure {
+            "6.10" => {
+                let learned = from_nothing(a, &context.objects)?;
+                draw_learning(&learned, &a.out)?;
+                finish(&a.out, "learning.json", &learned, &learning_markdown(&learned), json)
+            }
+            "6.13" => {
+                let rows = context.handles(a)?;
+                finish(&a.out, "handles.json", &rows, &handles_markdown(&rows), json)
+            }
+            _ => {
+                let transfer = context.transfer(a)?;
+                let mut text = String::new();
+                transfer.add_markdown(&mut text);
+                transfer.draw(&a.out, &context.instances)?;
+                finish(&a.out, "transfer.json", &transfer, &text, json)
+            }
+        };
     }
     let experiences = a.out.join("experience.db");
     eprintln!("1 of 5: experience on synthetic objects");
@@ -238,8 +266,40 @@ pub(crate) fn run(a: &ReproduceDgcmArguments, json: &JsonArguments) -> Result<Ou
     eprintln!("3 of 5: figure 6.7, against the number of experiences and between objects");
     let context = Context::of(a)?;
     let transfer = context.transfer(a)?;
-    let Context { setting, network, objects, parts, instances } = &context;
     eprintln!("4 of 5: figures 6.10 to 6.12, learning from nothing");
+    let incremental = from_nothing(a, &context.objects)?;
+    eprintln!("5 of 5: figure 6.13, handles");
+    let handles = context.handles(a)?;
+    let whole = Whole { quick: a.quick, compare, transfer, incremental, handles };
+    whole.draw(&a.out, &context.instances)?;
+    let text = whole.markdown();
+    write_atomically(&a.out.join("table.md"), text.as_bytes())?;
+    write_atomically(&a.out.join("reproduce.json"), serde_json::to_string_pretty(&whole)?.as_bytes())?;
+    report(json, &whole, || {
+        println!("{text}");
+        println!("table.md, reproduce.json and images are in {}", a.out.display());
+    })?;
+    Ok(Outcome::Found)
+}
+
+/// Writes and reports one figure's result.
+fn finish(
+    folder: &Path,
+    file: &str,
+    result: &impl Serialize,
+    text: &str,
+    json: &JsonArguments,
+) -> Result<Outcome> {
+    write_atomically(&folder.join(file), serde_json::to_string_pretty(result)?.as_bytes())?;
+    report(json, result, || {
+        println!("{text}");
+        println!("{file} is in {}", folder.display());
+    })?;
+    Ok(Outcome::Found)
+}
+
+/// Figures 6.10 to 6.12: objects learned from an empty store.
+fn from_nothing(a: &ReproduceDgcmArguments, objects: &Named) -> Result<Vec<FromNothing>> {
     let mut incremental = vec![];
     for (name, path) in objects.iter().map(|o| (&o.1, a.path_of(&o.1))) {
         if !FROM_NOTHING.iter().any(|end| name.ends_with(end)) {
@@ -262,32 +322,7 @@ pub(crate) fn run(a: &ReproduceDgcmArguments, json: &JsonArguments) -> Result<Ou
             incremental.push(FromNothing { hard, curves });
         }
     }
-    eprintln!("5 of 5: figure 6.13, handles");
-    let handled = a.out.join("handles").join("experience.db");
-    learn::learn(&LearnArguments {
-        families: vec!["mug".to_owned(), "drill".to_owned()],
-        members: if a.quick { 3 } else { 12 },
-        // The question is where the grasp is, not whether this hand could lift the object with it: the easy setting gives
-        // more experience.
-        hard: false,
-        tries: 10,
-        part: Some("handle".to_owned()),
-        near: 0.0,
-        ..a.learning("handles/learn", &handled, 4, vec![])
-    })?;
-    let handles =
-        Handles { objects, parts, network, setting, views: if a.quick { 2 } else { 10 }, seed: a.seed }
-            .run(&mut memory(&StorePlace::File(handled), network)?, &a.out.join("handles"))?;
-    let whole = Whole { quick: a.quick, compare, transfer, incremental, handles };
-    whole.draw(&a.out, instances)?;
-    let text = whole.markdown();
-    write_atomically(&a.out.join("table.md"), text.as_bytes())?;
-    write_atomically(&a.out.join("reproduce.json"), serde_json::to_string_pretty(&whole)?.as_bytes())?;
-    report(json, &whole, || {
-        println!("{text}");
-        println!("table.md, reproduce.json and images are in {}", a.out.display());
-    })?;
-    Ok(Outcome::Found)
+    Ok(incremental)
 }
 
 /// The command line's defaults.
@@ -482,11 +517,7 @@ impl Transfer {
 impl Whole {
     fn draw(&self, folder: &Path, instances: &[Instance]) -> Result<()> {
         self.transfer.draw(folder, instances)?;
-        let first: Vec<(&str, &Curve)> =
-            self.incremental.iter().filter_map(|o| Some((o.setting(), o.curves.first()?))).collect();
-        let picture = pictures::incremental(&first, NEAR);
-        write_rgb(&folder.join("incremental.png"), &picture)?;
-        Ok(())
+        draw_learning(&self.incremental, folder)
     }
 
     fn markdown(&self) -> String {
@@ -529,44 +560,64 @@ impl Whole {
         let seconds: Vec<String> = c.median_seconds.iter().map(|s| format!("{s:.2}")).collect();
         let _ = writeln!(out, "| median seconds to ranked grasps | | {} |", seconds.join(" | "));
         self.transfer.add_markdown(&mut out);
-        out += "\nLearning from nothing (figures 6.10 to 6.12): attempts of the first run in their order, G geometry, E experience, capitals held; successes of all runs\n\n| object | setting | attempts | held after the second success |\n|---|---|---|---|\n";
-        for of_object in &self.incremental {
-            let Some(first) = of_object.curves.first() else { continue };
-            let (held, of) = of_object
-                .curves
-                .iter()
-                .map(|c| after_second(&c.held))
-                .fold((0, 0), |a, b| (a.0 + b.0, a.1 + b.1));
-            let _ = writeln!(
-                out,
-                "| {} | {} | {} | {held} of {of} |",
-                first.object,
-                of_object.setting(),
-                learn::marks(first)
-            );
-        }
-        out += "\nFirst grasp on the handle (figure 6.13), views that show it\n\n| object | views | by experience on handles | by geometry alone |\n|---|---|---|---|\n";
-        let mut names: Vec<&String> = vec![];
-        for row in &self.handles {
-            if !names.contains(&&row.object) {
-                names.push(&row.object);
-            }
-        }
-        for name in names {
-            let rows: Vec<_> = self.handles.iter().filter(|r| r.object == *name).collect();
-            let count = |f: &dyn Fn(&handles::Row) -> Option<bool>| {
-                rows.iter().filter(|r| f(r) == Some(true)).count()
-            };
-            let _ = writeln!(
-                out,
-                "| {name} | {} | {} | {} |",
-                rows.len(),
-                count(&|r| r.by_experience),
-                count(&|r| r.by_geometry)
-            );
-        }
+        out += &learning_markdown(&self.incremental);
+        out += &handles_markdown(&self.handles);
         out
     }
+}
+
+/// The table of figures 6.10 to 6.12.
+fn learning_markdown(incremental: &[FromNothing]) -> String {
+    let mut out = String::new();
+    out += "\nLearning from nothing (figures 6.10 to 6.12): attempts of the first run in their order, G geometry, E experience, capitals held; successes of all runs\n\n| object | setting | attempts | held after the second success |\n|---|---|---|---|\n";
+    for of_object in incremental {
+        let Some(first) = of_object.curves.first() else { continue };
+        let (held, of) = of_object
+            .curves
+            .iter()
+            .map(|c| after_second(&c.held))
+            .fold((0, 0), |a, b| (a.0 + b.0, a.1 + b.1));
+        let _ = writeln!(
+            out,
+            "| {} | {} | {} | {held} of {of} |",
+            first.object,
+            of_object.setting(),
+            learn::marks(first)
+        );
+    }
+    out
+}
+
+/// The table of figure 6.13.
+fn handles_markdown(rows: &[handles::Row]) -> String {
+    let mut out = String::new();
+    out += "\nFirst grasp on the handle (figure 6.13), views that show it\n\n| object | views | by experience on handles | by geometry alone |\n|---|---|---|---|\n";
+    let mut names: Vec<&String> = vec![];
+    for row in rows {
+        if !names.contains(&&row.object) {
+            names.push(&row.object);
+        }
+    }
+    for name in names {
+        let rows: Vec<_> = rows.iter().filter(|r| r.object == *name).collect();
+        let count =
+            |f: &dyn Fn(&handles::Row) -> Option<bool>| rows.iter().filter(|r| f(r) == Some(true)).count();
+        let _ = writeln!(
+            out,
+            "| {name} | {} | {} | {} |",
+            rows.len(),
+            count(&|r| r.by_experience),
+            count(&|r| r.by_geometry)
+        );
+    }
+    out
+}
+
+/// Figures 6.10 to 6.12 as an image.
+fn draw_learning(incremental: &[FromNothing], folder: &Path) -> Result<()> {
+    let first: Vec<(&str, &Curve)> =
+        incremental.iter().filter_map(|o| Some((o.setting(), o.curves.first()?))).collect();
+    Ok(write_rgb(&folder.join("incremental.png"), &pictures::incremental(&first, NEAR))?)
 }
 
 /// The number of successful attempts after the second success, and the number of these attempts.
