@@ -104,17 +104,23 @@ fn theta_i_decides_which_pixels_are_correspondences() {
     assert_eq!([points(0.1), points(0.35)], [pixels.len() - uncertain, pixels.len()]);
 }
 
-#[test]
-fn theta_re_is_in_pixels_of_the_image() {
-    // Every fourth pixel has the coordinates of one 3 columns further, which are 6 pixels of the image.
+/// A prediction in which every fourth pixel has the coordinates of one some columns further, twice as many pixels of the image; the
+/// number of all pixels, and of these.
+fn partly_moved(columns: usize) -> (Prediction, usize, usize) {
     let exact = prediction(&truth());
     let mut p = exact.clone();
     let mut moved = 0;
-    for i in ball(&exact).into_iter().step_by(4).filter(|i| exact.visible[i + 3] > 0.5) {
-        p.coordinates[i] = exact.coordinates[i + 3];
+    for i in ball(&exact).into_iter().step_by(4).filter(|i| exact.visible[i + columns] > 0.5) {
+        p.coordinates[i] = exact.coordinates[i + columns];
         moved += 1;
     }
     let all = ball(&p).len();
+    (p, all, moved)
+}
+
+#[test]
+fn theta_re_is_in_pixels_of_the_image() {
+    let (p, all, moved) = partly_moved(3);
     let inliers = |reprojection| {
         let options = Pix2PoseOptions { reprojection, ..Pix2PoseOptions::published() };
         candidate(&p, 0.2, &options).hypothesis.inliers
@@ -127,14 +133,7 @@ fn theta_re_is_in_pixels_of_the_image() {
 /// The author's code allows 5 pixels.
 #[test]
 fn plain_pnp_counts_pixels_that_are_four_pixels_off() {
-    let exact = prediction(&truth());
-    let mut p = exact.clone();
-    let mut moved = 0;
-    for i in ball(&exact).into_iter().step_by(4).filter(|i| exact.visible[i + 2] > 0.5) {
-        p.coordinates[i] = exact.coordinates[i + 2];
-        moved += 1;
-    }
-    let all = ball(&p).len();
+    let (p, all, moved) = partly_moved(2);
     let inliers = |plain_pnp| {
         let quirks = Quirks { plain_pnp, ..Quirks::default() };
         candidate(&p, 0.2, &Pix2PoseOptions { quirks, ..Pix2PoseOptions::published() }).hypothesis.inliers

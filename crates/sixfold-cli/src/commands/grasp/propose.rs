@@ -206,7 +206,7 @@ fn with_experience(
         let wanted = part.map_or(String::new(), |part| format!(" on a part named {part}"));
         eprintln!("note: {place} holds no experience{wanted} that this network can use");
     }
-    if a.out.is_some() {
+    if a.out.is_some() && !grasps.found.nearest.is_empty() {
         *picture = Some(nearest_picture(&grasps, &mut memory, gripper)?);
     }
     Ok(of_both(planner, &grasps))
