@@ -55,9 +55,9 @@ pub(super) fn run(a: &LossCurveArguments, json: &JsonArguments) -> Result<Outcom
     let infos = infos.with_context(|| {
         format!("{}: its models have no models_info.json, which states their symmetries", a.dataset.display())
     })?;
-    let known = |id: &&u32| !infos.0.contains_key(*id);
-    if let Some(id) = a.ids.iter().find(known) {
-        bail!("--ids {id}: models_info.json of {} has no such object", a.dataset.display());
+    if let Some(id) = a.ids.iter().find(|id| !infos.0.contains_key(*id)) {
+        let known: Vec<String> = infos.0.keys().map(u32::to_string).collect();
+        bail!("--ids {id}: {} has no such object, its models are {}", a.dataset.display(), known.join(", "));
     }
     let chosen: Vec<u32> = if a.ids.is_empty() { infos.0.keys().copied().collect() } else { a.ids.clone() };
     let mut folder = OutputFolder::take(&a.out)?;
@@ -83,6 +83,10 @@ pub(super) fn run(a: &LossCurveArguments, json: &JsonArguments) -> Result<Outcom
     let whole = Whole { objects };
     folder.write_text("losses.json", &serde_json::to_string_pretty(&whole)?)?;
     report(json, &whole, || {
+        if whole.objects.is_empty() {
+            println!("no object has a discrete symmetry alone");
+            return;
+        }
         println!(
             "| object | loss | at 90 degrees | at 180 degrees | largest step of 2 degrees |\n|---|---|---:|---:|---:|"
         );

@@ -55,7 +55,8 @@ fn the_tables_of_chapter_6_are_made_and_kept() {
         (&serde_json::json!([]), &serde_json::json!([]))
     );
     assert!(dir.join("figure/transfer.json").is_file() && !dir.join("figure/compare").exists());
-    for (figure, key, file) in [("6.10", "incremental", "learning.json"), ("6.13", "handles", "handles.json")] {
+    for (figure, key, file) in [("6.10", "incremental", "learning.json"), ("6.13", "handles", "handles.json")]
+    {
         let alone = command.replace("--out out", &format!("--out alone --figure {figure}"));
         assert_eq!(sixfold(dir, &alone).expect(0).json(), json[key], "{figure}");
         assert!(dir.join("alone").join(file).is_file());

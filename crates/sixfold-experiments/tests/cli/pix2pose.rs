@@ -91,3 +91,24 @@ fn the_trainings_of_the_ablations_are_made_scored_and_kept() {
     assert_ne!(weights("fourfold-plain-l1"), weights("fourfold-transformer-loss"));
     assert!(rows.iter().any(|r| r["key"] == "trained-mesh-2-half-black"), "{rows:?}");
 }
+
+/// Figure 3.3, on the eggbox of the sample data.
+#[test]
+fn the_loss_of_a_symmetric_object_is_plotted_against_its_rotation() {
+    let dir = tempfile::tempdir().unwrap();
+    let demo = concat!(env!("CARGO_MANIFEST_DIR"), "/../../data/demo");
+    let command = |more: &str| format!("reproduce loss-curve --dataset {demo} --out curves {more}");
+    let json = sixfold(dir.path(), &command("--json")).expect(0).json();
+    let curve = &json["objects"]["10"];
+    let value = |loss: &str, step: usize| curve[loss][step].as_f64().unwrap();
+    assert_eq!(curve["degrees"][90], 180.0);
+    // After half a turn the eggbox looks nearly the same: only L1 is large.
+    assert!(value("l1", 90) > 5.0 * value("transformer", 90), "{curve}");
+    assert!(value("transformer", 45) > 5.0 * value("transformer", 90), "{curve}");
+    let plot = sixfold_io::read_rgb(&dir.path().join("curves/obj_000010.png")).unwrap();
+    assert!(plot.as_slice().iter().any(|p| *p != [255; 3]));
+    let none = sixfold(dir.path(), &command("--ids 1")).expect(1);
+    assert!(none.stderr.contains("object 1 has no curve"), "{}", none.stderr);
+    let unknown = sixfold(dir.path(), &command("--ids 999")).expect(2);
+    assert!(unknown.stderr.contains("--ids 999") && unknown.stderr.contains("12"), "{}", unknown.stderr);
+}
