@@ -102,7 +102,7 @@ fn the_loss_of_a_symmetric_object_is_plotted_against_its_rotation() {
     let curve = &json["objects"]["10"];
     let value = |loss: &str, step: usize| curve[loss][step].as_f64().unwrap();
     assert_eq!(curve["degrees"][90], 180.0);
-    // After half a turn the eggbox looks nearly the same: only L1 is large.
+    // After half a rotation the eggbox appears nearly the same: only L1 is large.
     assert!(value("l1", 90) > 5.0 * value("transformer", 90), "{curve}");
     assert!(value("transformer", 45) > 5.0 * value("transformer", 90), "{curve}");
     let plot = sixfold_io::read_rgb(&dir.path().join("curves/obj_000010.png")).unwrap();
