@@ -178,7 +178,9 @@ pub(super) fn run(a: &ReproduceTeachArguments, json: &JsonArguments) -> Result<O
         let row = match kept(&file, a) {
             Some(row) => row,
             None => {
-                let others: Vec<&Mesh> = (1..3).map(|k| &meshes[(i + k) % meshes.len()]).collect();
+                // Of a list of one or two objects, fewer: never a copy of the object itself.
+                let others: Vec<&Mesh> =
+                    (1..meshes.len().min(3)).map(|k| &meshes[(i + k) % meshes.len()]).collect();
                 let row = measured(a, &entry.name, &meshes[i], &others, &ground)?;
                 write_atomically(&file, serde_json::to_string_pretty(&row)?.as_bytes())?;
                 row
