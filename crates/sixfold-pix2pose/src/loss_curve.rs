@@ -40,17 +40,16 @@ pub fn loss_curve(mesh: &Mesh, info: &ModelInfo, steps: usize) -> Option<LossCur
     let whole = SymmetryMap::pool(info, &scale);
     let options = LossOptions { whole_mask: true, ..LossOptions::of(OutputKind::Paper) };
     let pixels = SIDE * SIDE;
+    // What a perfect network would predict, and the mask; the channel of the expected error does not enter the loss.
     let drawn = |pose: &Pose, limits: bool| {
-        let (coordinates, object) = targets(mesh, &scale, &camera, &canonical(pose, info, limits));
-        (coordinates, object.data)
+        let (mut raw, object) = targets(mesh, &scale, &camera, &canonical(pose, info, limits));
+        raw.resize(4 * pixels, 0.0);
+        (raw, object.data)
     };
     let truth = [false, true].map(|limits| drawn(&first, limits));
-    let value = |prediction: &[f32], (coordinates, object): &(Vec<f32>, Vec<f32>), pool: &[SymmetryMap]| {
-        let mut raw = prediction.to_vec();
-        // The channel of the expected error does not enter this term.
-        raw.resize(4 * pixels, 0.0);
-        let targets = Targets { coordinates, object, visible: object };
-        loss(&raw, &targets, pixels, pool, OutputKind::Paper, &options, 1.0).coordinates
+    let value = |raw: &[f32], (target, object): &(Vec<f32>, Vec<f32>), pool: &[SymmetryMap]| {
+        let targets = Targets { coordinates: &target[..3 * pixels], object, visible: object };
+        loss(raw, &targets, pixels, pool, OutputKind::Paper, &options, 1.0).coordinates
     };
     let mut curve = LossCurve { degrees: vec![], l1: vec![], view_limits: vec![], transformer: vec![] };
     for step in 0..=steps {

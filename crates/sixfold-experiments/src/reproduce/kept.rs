@@ -5,7 +5,7 @@ use std::path::Path;
 use anyhow::{Context, Result, bail};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
-use sixfold_shell::output::write_atomically;
+use sixfold_shell::output::{JsonArguments, report, write_atomically};
 
 /// The stored row of an earlier run, or a new one, which is stored.
 pub(super) fn kept_or_made<T: Serialize + DeserializeOwned>(
@@ -24,6 +24,34 @@ pub(super) fn kept_or_made<T: Serialize + DeserializeOwned>(
     write_atomically(&path, text.as_bytes())?;
     // Read it back as a later run will: numbers as text may lose their last digit.
     serde_json::from_str(&text).with_context(|| format!("row {key}"))
+}
+
+/// Writes `table.md` and `reproduce.json` into the folder and reports them; `files` names everything that is then in it.
+pub(super) fn write_table(
+    folder: &Path,
+    text: &str,
+    result: &impl Serialize,
+    files: &str,
+    json: &JsonArguments,
+) -> Result<()> {
+    write_atomically(&folder.join("table.md"), text.as_bytes())?;
+    write_result(folder, "reproduce.json", text, result, files, json)
+}
+
+/// The same with the result in a file of another name, and without a table.
+pub(super) fn write_result(
+    folder: &Path,
+    file: &str,
+    text: &str,
+    result: &impl Serialize,
+    files: &str,
+    json: &JsonArguments,
+) -> Result<()> {
+    write_atomically(&folder.join(file), serde_json::to_string_pretty(result)?.as_bytes())?;
+    report(json, result, || {
+        println!("{text}");
+        println!("{files} in {}", folder.display());
+    })
 }
 
 /// An error if the folder contains rows from other inputs.

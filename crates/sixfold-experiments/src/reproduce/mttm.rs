@@ -21,9 +21,10 @@ use sixfold_mttm::{KnownObject, MaskSource, MatchedBy, MttmEstimator, MttmObject
 use sixfold_ppf::{ObjectModel, PpfEstimator, PpfObject, PpfOptions};
 use sixfold_render::render_depth;
 
+use super::kept::write_table;
 use sixfold_shell::Outcome;
 use sixfold_shell::datasets;
-use sixfold_shell::output::{JsonArguments, report, write_atomically};
+use sixfold_shell::output::{JsonArguments, write_atomically};
 use sixfold_shell::progress::{Progress, check_interrupt};
 use sixfold_shell::ranges::folder_name;
 
@@ -312,13 +313,13 @@ pub(crate) fn run(a: &ReproduceMttmArguments, json: &JsonArguments) -> Result<Ou
             ("dissertation, table 5.2: ADD(-S) below a tenth of the diameter, mean of the objects", 0.529),
         ]),
     };
-    let text = markdown(&whole);
-    write_atomically(&a.out.join("table.md"), text.as_bytes())?;
-    write_atomically(&a.out.join("reproduce.json"), serde_json::to_string_pretty(&whole)?.as_bytes())?;
-    report(json, &whole, || {
-        println!("{text}");
-        println!("table.md, reproduce.json and the images' outcomes are in {}", a.out.display());
-    })?;
+    write_table(
+        &a.out,
+        &markdown(&whole),
+        &whole,
+        "table.md, reproduce.json and the images' outcomes are",
+        json,
+    )?;
     let any = whole.rows.iter().any(|r| r.all.add_s > 0.0);
     Ok(if any { Outcome::Found } else { Outcome::NothingFound })
 }

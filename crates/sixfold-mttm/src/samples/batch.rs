@@ -18,7 +18,7 @@ pub struct Augmentation {
     /// Largest shift along its axis, as a fraction of the patch.
     pub depth: f64,
     /// Probability that a patch and its templates are rotated by 90, 180 or 270 degrees.
-    pub turned: f64,
+    pub rotated: f64,
     /// Whether half of the patches are mirrored with their templates.
     pub mirrored: bool,
     /// Probability of an occluder in front.
@@ -29,7 +29,7 @@ pub struct Augmentation {
 
 impl Default for Augmentation {
     fn default() -> Self {
-        Augmentation { shift: 0.12, depth: 0.1, turned: 0.3, mirrored: true, hidden: 0.25, lost: 0.25 }
+        Augmentation { shift: 0.12, depth: 0.1, rotated: 0.3, mirrored: true, hidden: 0.25, lost: 0.25 }
     }
 }
 
@@ -38,7 +38,7 @@ impl Augmentation {
     pub fn published() -> Self {
         Augmentation {
             depth: 0.0,
-            turned: 0.0,
+            rotated: 0.0,
             mirrored: false,
             hidden: 0.0,
             lost: 0.0,
@@ -247,7 +247,7 @@ impl Change {
         let first = [0, 1].map(|_| border + random.random_range(0..=2 * most) - most);
         let across = |k: usize| (first[k] as f32 - border as f32) / side as f32;
         let along = (how.depth * (2.0 * random.random::<f64>() - 1.0)) as f32;
-        let turns = if random.random_bool(how.turned) { random.random_range(1..4) } else { 0 };
+        let turns = if random.random_bool(how.rotated) { random.random_range(1..4) } else { 0 };
         let mut rectangles = vec![];
         if random.random_bool(how.lost) {
             let width = random.random_range(1..=side / 3);

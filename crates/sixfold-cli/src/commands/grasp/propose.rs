@@ -86,26 +86,24 @@ pub(super) fn run(a: &ProposeArguments) -> Result<Outcome> {
     let planner = Planner::new(&a.planner)?;
     #[cfg(feature = "experience")]
     check_combination(a, &planner)?;
-    #[cfg_attr(not(feature = "experience"), allow(unused_mut))]
-    let mut nearest: Option<RgbImage> = None;
     let mut folder = a.out.as_deref().map(OutputFolder::take).transpose()?;
     let files = folder.as_mut().map(|f| f.files(&["overlay.png", "grasps.json"])).transpose()?;
     let Input { depth, camera, rgb, view, began } = input::read(&a.input, a.rgb.as_deref(), a.seed)?;
-    let proposed: Vec<Proposed> = match &view {
-        None => vec![],
+    let (proposed, nearest): (Vec<Proposed>, Option<RgbImage>) = match &view {
+        None => (vec![], None),
         Some(view) => {
             let default = AntipodalOptions::default();
             let completion = default.completion.filter(|_| !a.seen_only);
             let options = AntipodalOptions { seed: a.seed, completion, ..default };
             let alone = || anyhow::Ok(of_planner(&planner, &planner.grasps(view, &gripper, &options)?));
             #[cfg(feature = "experience")]
-            let found = match &a.experiences {
-                Some(_) => with_experience(a, view, &gripper, &planner, &options, &mut nearest)?,
-                None => alone()?,
+            let (found, nearest) = match &a.experiences {
+                Some(_) => with_experience(a, view, &gripper, &planner, &options)?,
+                None => (alone()?, None),
             };
             #[cfg(not(feature = "experience"))]
-            let found = alone()?;
-            found.into_iter().take(a.number.get()).collect()
+            let (found, nearest) = (alone()?, None);
+            (found.into_iter().take(a.number.get()).collect(), nearest)
         }
     };
     let seconds = began.elapsed().as_secs_f64();
@@ -178,7 +176,7 @@ fn check_combination(a: &ProposeArguments, planner: &Planner) -> Result<()> {
 }
 
 /// Grasps from geometry and from experience, ranked together; with a part's name, only those on the part according to
-/// experience on it.
+/// experience on it. With --out also an image of the nearest experiences.
 #[cfg(feature = "experience")]
 fn with_experience(
     a: &ProposeArguments,
@@ -186,9 +184,8 @@ fn with_experience(
     gripper: &Gripper,
     planner: &Planner,
     options: &AntipodalOptions,
-    picture: &mut Option<RgbImage>,
-) -> Result<Vec<Proposed>> {
-    let Some(place) = &a.experiences else { return Ok(vec![]) };
+) -> Result<(Vec<Proposed>, Option<RgbImage>)> {
+    let Some(place) = &a.experiences else { return Ok((vec![], None)) };
     let network = experience::model(&a.network)?;
     let mut memory = experience::memory(place, &network)?;
     let part = a.part.as_deref();
@@ -206,10 +203,9 @@ fn with_experience(
         let wanted = part.map_or(String::new(), |part| format!(" on a part named {part}"));
         eprintln!("note: {place} holds no experience{wanted} that this network can use");
     }
-    if a.out.is_some() && !grasps.found.nearest.is_empty() {
-        *picture = Some(nearest_picture(&grasps, &mut memory, gripper)?);
-    }
-    Ok(of_both(planner, &grasps))
+    let shown = a.out.is_some() && !grasps.found.nearest.is_empty();
+    let picture = shown.then(|| nearest_picture(&grasps, &mut memory, gripper)).transpose()?;
+    Ok((of_both(planner, &grasps), picture))
 }
 
 fn report_grasps(whole: &Whole, folder: Option<&std::path::Path>) {

@@ -17,6 +17,7 @@ use sixfold_io::write_rgb;
 use self::handles::Handles;
 use self::offline::{Answer, COUNTS, Form, Instance, Offline, Question, Size};
 use self::pictures::Line;
+use super::kept::{write_result, write_table};
 use crate::grasp::compare::{self, CompareArguments};
 use crate::grasp::ways::METHODS;
 use sixfold_shell::Outcome;
@@ -24,7 +25,7 @@ use sixfold_shell::grasp::experience::{NetworkArguments, OutboxArguments, memory
 use sixfold_shell::grasp::learn::{self, Curve, LearnArguments};
 use sixfold_shell::grasp::object_list::{Named, ObjectsArguments, PartBox, file_name, objects_with_parts};
 use sixfold_shell::grasp::trial::{Hardness, PhysicsArguments, hardness};
-use sixfold_shell::output::{JsonArguments, report, write_atomically};
+use sixfold_shell::output::JsonArguments;
 
 /// Values of `--figure`: figure 6.7 in all forms, by the network alone, and as published; figures 6.10 to 6.12; figure 6.13.
 const FIGURES: [&str; 5] = ["6.7", "6.7-network", "6.7-published", "6.10", "6.13"];
@@ -219,24 +220,33 @@ impl Context {
 pub(crate) fn run(a: &ReproduceDgcmArguments, json: &JsonArguments) -> Result<Outcome> {
     if let Some(figure) = a.figure.as_deref() {
         let context = Context::of(a)?;
-        return match figure {
+        match figure {
             "6.10" => {
                 let learned = from_nothing(a, &context.objects)?;
                 draw_learning(&learned, &a.out)?;
-                finish(&a.out, "learning.json", &learned, &learning_markdown(&learned), json)
+                let text = learning_markdown(&learned);
+                write_result(&a.out, "learning.json", &text, &learned, "learning.json is", json)?;
             }
             "6.13" => {
                 let rows = context.handles(a)?;
-                finish(&a.out, "handles.json", &rows, &handles_markdown(&rows), json)
+                write_result(
+                    &a.out,
+                    "handles.json",
+                    &handles_markdown(&rows),
+                    &rows,
+                    "handles.json is",
+                    json,
+                )?;
             }
             _ => {
                 let transfer = context.transfer(a)?;
+                transfer.draw(&a.out, &context.instances)?;
                 let mut text = String::new();
                 transfer.add_markdown(&mut text);
-                transfer.draw(&a.out, &context.instances)?;
-                finish(&a.out, "transfer.json", &transfer, &text, json)
+                write_result(&a.out, "transfer.json", &text, &transfer, "transfer.json is", json)?;
             }
-        };
+        }
+        return Ok(Outcome::Found);
     }
     let experiences = a.out.join("experience.db");
     eprintln!("1 of 5: experience on synthetic objects");
@@ -272,29 +282,7 @@ pub(crate) fn run(a: &ReproduceDgcmArguments, json: &JsonArguments) -> Result<Ou
     let handles = context.handles(a)?;
     let whole = Whole { quick: a.quick, compare, transfer, incremental, handles };
     whole.draw(&a.out, &context.instances)?;
-    let text = whole.markdown();
-    write_atomically(&a.out.join("table.md"), text.as_bytes())?;
-    write_atomically(&a.out.join("reproduce.json"), serde_json::to_string_pretty(&whole)?.as_bytes())?;
-    report(json, &whole, || {
-        println!("{text}");
-        println!("table.md, reproduce.json and images are in {}", a.out.display());
-    })?;
-    Ok(Outcome::Found)
-}
-
-/// Writes and reports one figure's result.
-fn finish(
-    folder: &Path,
-    file: &str,
-    result: &impl Serialize,
-    text: &str,
-    json: &JsonArguments,
-) -> Result<Outcome> {
-    write_atomically(&folder.join(file), serde_json::to_string_pretty(result)?.as_bytes())?;
-    report(json, result, || {
-        println!("{text}");
-        println!("{file} is in {}", folder.display());
-    })?;
+    write_table(&a.out, &whole.markdown(), &whole, "table.md, reproduce.json and images are", json)?;
     Ok(Outcome::Found)
 }
 

@@ -26,9 +26,9 @@ use self::picture::Strips;
 use self::poses::{PosesRow, PosesSummary};
 use self::speed::Speed;
 use self::views::{Networks, Target, ViewRow, ViewsSummary, Way};
-use super::kept::{kept_or_made, same_inputs};
+use super::kept::{kept_or_made, same_inputs, write_table};
 use sixfold_shell::Outcome;
-use sixfold_shell::output::{JsonArguments, report, write_atomically};
+use sixfold_shell::output::JsonArguments;
 use sixfold_shell::progress::{Progress, check_interrupt};
 
 /// The message after an interrupt.
@@ -147,13 +147,13 @@ pub(super) fn run(a: &ReproduceNolArguments, json: &JsonArguments) -> Result<Out
         lamps: views::summaries(&lamp_rows),
         speed,
     };
-    let text = table::markdown(&result);
-    write_atomically(&a.out.join("table.md"), text.as_bytes())?;
-    write_atomically(&a.out.join("reproduce.json"), serde_json::to_string_pretty(&result)?.as_bytes())?;
-    report(json, &result, || {
-        println!("{text}");
-        println!("table.md, reproduce.json, the images and the rows are in {}", a.out.display());
-    })?;
+    write_table(
+        &a.out,
+        &table::markdown(&result),
+        &result,
+        "table.md, reproduce.json, the images and the rows are",
+        json,
+    )?;
     Ok(if view_rows.is_empty() { Outcome::NothingFound } else { Outcome::Found })
 }
 

@@ -23,11 +23,11 @@ use sixfold_pix2pose::estimate::{Pix2PoseOptions, Quirks};
 
 use self::model::Pix2Pose;
 use self::row::{Row, Setting};
-use super::kept::{kept_or_made, same_inputs};
+use super::kept::{kept_or_made, same_inputs, write_table};
 use sixfold_runner::RegionSource;
 use sixfold_shell::Outcome;
 use sixfold_shell::datasets;
-use sixfold_shell::output::{JsonArguments, report, write_atomically};
+use sixfold_shell::output::JsonArguments;
 use sixfold_shell::progress::check_interrupt;
 use sixfold_shell::ranges::folder_name;
 use sixfold_shell::training::was_trained_on;
@@ -205,13 +205,13 @@ pub(crate) fn run(a: &ReproducePix2PoseArguments, json: &JsonArguments) -> Resul
         ("BOP Challenge 2020, LM-O, Pix2Pose from RGB: AR (VSD, MSSD, MSPD)", 0.363),
     ]);
     let result = Whole { inputs, frames: frames.len(), targets: bench.targets.len(), rows, literature };
-    let text = table::markdown(&result);
-    write_atomically(&a.out.join("table.md"), text.as_bytes())?;
-    write_atomically(&a.out.join("reproduce.json"), serde_json::to_string_pretty(&result)?.as_bytes())?;
-    report(json, &result, || {
-        println!("{text}");
-        println!("table.md, reproduce.json and the rows are in {}", a.out.display());
-    })?;
+    write_table(
+        &a.out,
+        &table::markdown(&result),
+        &result,
+        "table.md, reproduce.json and the rows are",
+        json,
+    )?;
     let any = result.rows.first().is_some_and(|r| r.found > 0);
     Ok(if any { Outcome::Found } else { Outcome::NothingFound })
 }
