@@ -1,7 +1,5 @@
 //! The command line, defined once for parsing, `--help` and completions.
 
-use std::num::NonZeroUsize;
-
 use clap::{Parser, Subcommand};
 use sixfold_shell::meshes::MeshArguments;
 
@@ -25,7 +23,7 @@ use crate::commands::simulate::SimulateArguments;
 use crate::commands::synthesize::{AFTER_HELP as SYNTHESIZE_HELP, SynthesizeArguments};
 use crate::commands::teach::{AFTER_HELP as TEACH_HELP, TeachArguments};
 use crate::commands::train::TrainArguments;
-use sixfold_shell::ranges::threads;
+use sixfold_shell::processor::ProcessorArguments;
 
 /// 6D object pose and grasp transfer from little data.
 #[derive(Debug, Parser)]
@@ -35,9 +33,8 @@ use sixfold_shell::ranges::threads;
     after_help = "Example:\n  sixfold demo\n\nExit status: 0 found, 1 nothing found, 2 error."
 )]
 pub(crate) struct Arguments {
-    /// Use this many threads (default: all cores); the results are the same for any number
-    #[arg(long, global = true, value_name = "N", value_parser = threads)]
-    pub threads: Option<NonZeroUsize>,
+    #[command(flatten)]
+    pub processor: ProcessorArguments,
     #[command(flatten)]
     pub images: PixelLimit,
     #[command(flatten)]

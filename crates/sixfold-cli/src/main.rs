@@ -14,7 +14,7 @@ use std::process::ExitCode;
 
 use clap::CommandFactory;
 use sixfold_shell::screen::parse;
-use sixfold_shell::{exit_code, progress, use_threads};
+use sixfold_shell::{exit_code, progress};
 
 use crate::arguments::{Arguments, Command};
 
@@ -24,10 +24,9 @@ fn main() -> ExitCode {
         Err(code) => return code,
     };
     progress::catch_interrupts();
-    use_threads(arguments.threads);
     arguments.images.set();
     arguments.meshes.apply();
-    exit_code(&match &arguments.command {
+    exit_code(&arguments.processor.prepare().and_then(|()| match &arguments.command {
         Command::Demo(a) => commands::demo::run(a),
         Command::Estimate(a) => commands::estimate::run(a),
         Command::Detect(a) => commands::detect::run(a),
@@ -47,5 +46,5 @@ fn main() -> ExitCode {
         Command::Teach(a) => commands::teach::run(a),
         Command::Serve(a) => commands::serve::run(a),
         Command::Completions(a) => commands::completions::run(a, Arguments::command()),
-    })
+    }))
 }

@@ -9,6 +9,7 @@ use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
 use sixfold_geometry::{Rect, RgbImage};
+use sixfold_nn::device;
 use sixfold_nn::pretrained::PretrainedError;
 use sixfold_nn::weights::{
     ModelCard, WeightsError, load_weights, load_weights_from_bytes, read_card, save_weights,
@@ -162,7 +163,7 @@ impl DetectorModel {
         extra["use"] = serde_json::to_value(usage).unwrap_or_default();
         let objects = classes.iter().map(|c| serde_json::to_value(c).unwrap_or_default()).collect();
         let card = ModelCard { architecture: architecture(&config).to_string(), objects, extra, ..card };
-        DetectorModel { network: anchorless(network, config, Device::flex()), classes, usage, card }
+        DetectorModel { network: anchorless(network, config, device::chosen()), classes, usage, card }
     }
 
     /// Reads a weight file: one written by a training, or torchvision's weights of Faster R-CNN, Mask R-CNN or RetinaNet (`.pth`,
@@ -177,11 +178,11 @@ impl DetectorModel {
             return Self::of_torchvision(path);
         }
         if anchored_kind(&read_card(path)?).is_some() {
-            let (network, labels, classes, usage, card) = read_anchored(path, &Device::flex())?;
+            let (network, labels, classes, usage, card) = read_anchored(path, &device::chosen())?;
             let network = network.with_labels(&labels);
             return Ok(DetectorModel { network: Network::Anchored(network, labels), classes, usage, card });
         }
-        let device = Device::flex();
+        let device = device::chosen();
         let (network, config, classes, usage, card) = read(path, &device)?;
         Ok(DetectorModel { network: anchorless(network, config, device), classes, usage, card })
     }
@@ -214,7 +215,7 @@ impl DetectorModel {
     /// # Errors
     /// [`ModelError`] if the shipped weights have another version than the program.
     pub fn proposals() -> Result<Self, ModelError> {
-        let device = Device::flex();
+        let device = device::chosen();
         let config = DetectorConfig::proposals();
         let name = Path::new("proposals.safetensors");
         let (network, card) =

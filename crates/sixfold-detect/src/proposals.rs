@@ -7,12 +7,12 @@
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-use burn::tensor::Device;
 use rand::RngExt;
 use sixfold_data::{TrainingObject, background_files, plain_backgrounds};
 use sixfold_geometry::random::{Random, stream};
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_mesh::{Mesh, ModelInfo};
+use sixfold_nn::device;
 use sixfold_nn::fingerprint::Fingerprint;
 use sixfold_nn::lite0::imagenet_encoder;
 use sixfold_nn::options::OptionError;
@@ -223,7 +223,7 @@ impl Recipe for ProposalsRecipe {
         (): (),
         _: &mut Session<'_>,
     ) -> Result<Prepared<DetectorTraining, Backgrounds>, TrainError> {
-        let device = Device::flex().autodiff();
+        let device = device::chosen().autodiff();
 
         let config = DetectorConfig::proposals();
         let encoder = Encoder::Lite0(imagenet_encoder(&device)?);
@@ -270,6 +270,7 @@ impl Recipe for ProposalsRecipe {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use burn::tensor::Device;
 
     #[test]
     fn every_option_and_every_background_counts() {

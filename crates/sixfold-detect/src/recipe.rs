@@ -8,6 +8,7 @@ use burn::tensor::Device;
 use serde_json::json;
 use sixfold_data::{PosedImage, TrainingSet, background_files, plain_backgrounds};
 use sixfold_nn::choice::Choice;
+use sixfold_nn::device;
 use sixfold_nn::fingerprint::Fingerprint;
 use sixfold_nn::lite0::imagenet_encoder;
 use sixfold_nn::options::OptionError;
@@ -311,7 +312,7 @@ impl Recipe for DetectorRecipe {
         _: &mut Session<'_>,
     ) -> Result<Prepared<AnyTraining, Context>, TrainError> {
         let ids: Vec<u32> = material.objects.iter().map(|o| o.id).collect();
-        let device = Device::flex().autodiff();
+        let device = device::chosen().autodiff();
         let options = self.options();
         let mut card = ModelCard::new("", &format!("Detector, {} network", self.network.name()));
         card.data.clone_from(&material.description);

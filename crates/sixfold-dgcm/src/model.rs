@@ -6,6 +6,7 @@ use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use sixfold_experience::{Crop, CropOptions, FeatureExtractor};
 use sixfold_io::fnv1a;
+use sixfold_nn::device;
 use sixfold_nn::weights::{
     ModelCard, WeightsError, load_weights, load_weights_from_bytes, read_card, save_weights,
     write_card_markdown,
@@ -59,7 +60,7 @@ impl DgcmModel {
         }
         extra["crop"] = serde_json::to_value(crop).unwrap_or_default();
         let card = ModelCard { architecture: network.architecture().to_owned(), extra, ..card };
-        DgcmModel { network: network.valid(), crop, card, device: Device::flex() }
+        DgcmModel { network: network.valid(), crop, card, device: device::chosen() }
     }
 
     /// Reads a weight file.
@@ -68,7 +69,7 @@ impl DgcmModel {
     /// [`ModelError`] for a file that cannot be read or is not a DGCM-Net.
     pub fn load(path: &Path) -> Result<Self, ModelError> {
         let card = read_card(path)?;
-        let device = Device::flex();
+        let device = device::chosen();
         let (network, crop) = Self::described(path, &card, &device)?;
         let (network, card) = load_weights(network, path, &card.architecture)?;
         Ok(DgcmModel { network: network.valid(), crop, card, device })
@@ -79,7 +80,7 @@ impl DgcmModel {
     /// # Errors
     /// [`ModelError`].
     pub fn from_bytes(name: &Path, bytes: &[u8]) -> Result<Self, ModelError> {
-        let device = Device::flex();
+        let device = device::chosen();
         let compact = "dgcm-compact";
         let network = Network::of_architecture(compact, &device)
             .unwrap_or_else(|| unreachable!("the compact network is known"));

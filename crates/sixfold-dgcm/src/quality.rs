@@ -3,11 +3,12 @@
 
 use std::collections::BTreeMap;
 
-use burn::tensor::{Device, Tensor, TensorData};
+use burn::tensor::{Tensor, TensorData};
 use serde::{Deserialize, Serialize};
 
 use crate::networks::{Network, VIEW, numbers};
 use crate::samples::{PairOptions, Pool};
+use sixfold_nn::device;
 
 /// Pairs per forward pass.
 const AT_A_TIME: usize = 16;
@@ -41,7 +42,7 @@ impl Quality {
 
 /// Measures a network on `pairs` positive pairs of a pool.
 pub fn quality(network: &Network, pool: &Pool, pairs: usize) -> Quality {
-    let (device, side) = (Device::flex(), network.side());
+    let (device, side) = (device::chosen(), network.side());
     let pixels = side * side;
     let options = PairOptions::default();
     let mut errors: BTreeMap<String, (f64, usize)> = BTreeMap::new();
@@ -91,6 +92,7 @@ mod tests {
     use super::*;
     use crate::networks::CompactConfig;
     use crate::samples::GraspPoolOptions;
+    use burn::tensor::Device;
 
     #[test]
     fn a_network_that_keeps_the_views_own_coordinates_is_as_good_as_these() {

@@ -2,8 +2,8 @@
 
 use std::path::PathBuf;
 
-use burn::tensor::Device;
 use sixfold_nn::choice::Choice;
+use sixfold_nn::device;
 use sixfold_nn::fingerprint::Fingerprint;
 use sixfold_nn::options::OptionError;
 use sixfold_nn::recipe::{Prepared, Recipe, Session, TrainingEvent, continued_from};
@@ -187,7 +187,7 @@ impl Recipe for DgcmRecipe {
         _: (),
         _: &mut Session<'_>,
     ) -> Result<Prepared<DgcmTraining, GraspPoolOptions>, TrainError> {
-        let device = Device::flex().autodiff();
+        let device = device::chosen().autodiff();
         let mut network = match (self.network, &self.encoder) {
             (DgcmKind::Compact, _) => Network::Compact(CompactConfig.init(self.seed, &device)),
             (DgcmKind::Paper, None) => Network::Paper(PaperConfig.init(self.seed, &device)),

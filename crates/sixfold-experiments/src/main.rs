@@ -11,15 +11,14 @@ mod charts;
 mod grasp;
 mod reproduce;
 
-use std::num::NonZeroUsize;
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 use sixfold_shell::idle::{Idle, When};
 use sixfold_shell::meshes::MeshArguments;
-use sixfold_shell::ranges::threads;
+use sixfold_shell::processor::ProcessorArguments;
 use sixfold_shell::screen::parse;
-use sixfold_shell::{PixelLimit, exit_code, progress, use_threads};
+use sixfold_shell::{PixelLimit, exit_code, progress};
 
 /// Options that would have no effect in combination with others, and are refused.
 const IDLE: &[Idle] = &[
@@ -36,9 +35,8 @@ const IDLE: &[Idle] = &[
         Exit status: 0 found, 1 nothing found, 2 error."
 )]
 struct Arguments {
-    /// Use this many threads (default: all cores); the results are the same for any number
-    #[arg(long, global = true, value_name = "N", value_parser = threads)]
-    threads: Option<NonZeroUsize>,
+    #[command(flatten)]
+    processor: ProcessorArguments,
     #[command(flatten)]
     images: PixelLimit,
     #[command(flatten)]
@@ -67,12 +65,11 @@ fn main() -> ExitCode {
         Err(code) => return code,
     };
     progress::catch_interrupts();
-    use_threads(arguments.threads);
     arguments.images.set();
     arguments.meshes.apply();
-    exit_code(&match &arguments.command {
+    exit_code(&arguments.processor.prepare().and_then(|()| match &arguments.command {
         Command::Reproduce(a) => reproduce::run(a),
         Command::Grasp(a) => grasp::run(a),
         Command::Charts(a) => charts::run(a),
-    })
+    }))
 }

@@ -8,6 +8,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use rayon::prelude::*;
 use sixfold_geometry::nalgebra::{Quaternion, UnitQuaternion};
 use sixfold_io::fnv1a;
+use sixfold_nn::device;
 use sixfold_nn::weights::{
     ModelCard, WeightsError, load_weights, load_weights_from_bytes, read_card, save_weights,
     write_card_markdown,
@@ -93,7 +94,7 @@ impl MttmModel {
     /// A model of a trained network; its architecture is written into `card`.
     pub fn new(network: Network, card: ModelCard) -> Self {
         let card = ModelCard { architecture: network.architecture().to_owned(), ..card };
-        MttmModel { network: network.valid(), card, device: Device::flex() }
+        MttmModel { network: network.valid(), card, device: device::chosen() }
     }
 
     /// Reads a weight file.
@@ -102,7 +103,7 @@ impl MttmModel {
     /// [`ModelError`] for a file that cannot be read or contains another network.
     pub fn load(path: &Path) -> Result<Self, ModelError> {
         let card = read_card(path)?;
-        let device = Device::flex();
+        let device = device::chosen();
         let network =
             Network::of_architecture(&card.architecture, &device).ok_or_else(|| ModelError::Card {
                 file: path.to_path_buf(),
@@ -119,7 +120,7 @@ impl MttmModel {
     /// # Errors
     /// [`ModelError`].
     pub fn from_bytes(name: &Path, bytes: &[u8]) -> Result<Self, ModelError> {
-        let (device, compact) = (Device::flex(), "mttm-compact");
+        let (device, compact) = (device::chosen(), "mttm-compact");
         let network = Network::of_architecture(compact, &device)
             .unwrap_or_else(|| unreachable!("the compact network is known"));
         let (network, card) = load_weights_from_bytes(network, name, bytes, compact)?;

@@ -1,7 +1,7 @@
 //! How good a network is on regions it was not trained on.
 
 use burn::tensor::activation::sigmoid;
-use burn::tensor::{Device, Tensor, TensorData};
+use burn::tensor::{Tensor, TensorData};
 use serde::{Deserialize, Serialize};
 use sixfold_geometry::stats::upper_median;
 
@@ -9,6 +9,7 @@ use crate::loss::squared_distance;
 use crate::network::{MAP, Network, masked};
 use crate::patch::PLANES;
 use crate::samples::{Augmentation, Batch, PairBatchOptions, Pool};
+use sixfold_nn::device;
 
 /// Accuracy of a network on regions with templates of about the right pose. Medians and fractions.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -45,7 +46,7 @@ impl Quality {
 
 /// Measures a network on a pool, in batches of 40 regions, each once on average.
 pub fn quality(network: &Network, pool: &Pool) -> Quality {
-    let device = Device::flex();
+    let device = device::chosen();
     let augmentation = Augmentation { hidden: 0.0, lost: 0.0, ..Augmentation::default() };
     let options = PairBatchOptions { anchors: 40, without_object: 0, other_objects: 0.0, augmentation };
     let steps = (pool.with_object().len() / options.anchors).max(1);

@@ -3,7 +3,6 @@
 
 use std::path::PathBuf;
 
-use burn::tensor::Device;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
@@ -11,6 +10,7 @@ use sixfold_geometry::Progress;
 use sixfold_io::write_rgb;
 use sixfold_mesh::Mesh;
 use sixfold_nn::choice::Choice;
+use sixfold_nn::device;
 use sixfold_nn::fingerprint::Fingerprint;
 use sixfold_nn::options::OptionError;
 use sixfold_nn::recipe::{Prepared, Recipe, Session, TrainingEvent};
@@ -177,7 +177,7 @@ impl Recipe for MttmRecipe {
         _: (),
         _: &mut Session<'_>,
     ) -> Result<Prepared<MttmTraining, DepthPoolOptions>, TrainError> {
-        let device = Device::flex().autodiff();
+        let device = device::chosen().autodiff();
         let network = match (self.network, &self.encoder) {
             (MttmKind::Compact, _) => Network::Compact(CompactConfig.init(self.seed, &device)),
             (MttmKind::Paper, None) => Network::Paper(PaperConfig.init(self.seed, &device)),

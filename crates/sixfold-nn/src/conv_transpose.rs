@@ -17,8 +17,10 @@ use burn::tensor::{DType, Device, Shape, Tensor, TensorData};
 use burn_flex::{FlexTensor, Layout};
 use rand::Rng;
 
+use crate::device::has_kernels;
 use crate::kernels::{Activation, ConvShape, ConvSpec, conv_backward, conv_forward};
 use crate::layers::normal;
+use crate::portable;
 
 /// Alignment of output and input.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -191,6 +193,9 @@ pub fn conv_transpose(x: Tensor<4>, weight: Tensor<4>, spec: TransposedSpec) -> 
         x.dims(),
         weight.dims()
     );
+    if !has_kernels(&x.device()) {
+        return portable::conv_transpose(x, weight, spec);
+    }
     Tensor::from_dispatch(Dispatch::sixfold_conv_transpose(x.into_dispatch(), weight.into_dispatch(), spec))
 }
 
@@ -282,6 +287,7 @@ mod tests {
             let options =
                 ConvTransposeOptions::new([stride, stride], [padding, padding], [more, more], [1, 1], 1);
             let burns = conv_transpose2d(x.clone(), weight.clone(), None, options);
+            close(portable::conv_transpose(x.clone(), weight.clone(), spec), burns.clone(), "portable");
             close(ours.clone(), burns.clone(), "output");
             let factor = tensor(burns.dims(), 2.0, &device);
             let (a, b) = ((ours * factor.clone()).sum().backward(), (burns * factor).sum().backward());

@@ -9,6 +9,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use rayon::prelude::*;
 use sixfold_geometry::{OptionError, RgbImage, Vec2};
 
+use crate::device;
 use crate::weights::WeightsError;
 use crate::xfeat::{CELL, CHANNELS, MULTIPLE, XFeat};
 
@@ -109,7 +110,7 @@ impl KeypointFinder {
     /// # Errors
     /// [`WeightsError`] if the shipped weights have another version than the program.
     pub fn shipped() -> Result<KeypointFinder, WeightsError> {
-        let device = Device::default();
+        let device = device::chosen();
         Ok(KeypointFinder { network: XFeat::shipped(&device)?, device })
     }
 

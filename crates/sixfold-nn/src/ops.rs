@@ -4,10 +4,11 @@
 //! Burn's `flex` backend derives the gradients of a convolution from further convolutions, which is slow; these use matrix products
 //! over patches instead, and a single pass for bias and activation.
 
+use crate::device::has_kernels;
 use crate::kernels::{
-    Activation, ConvShape, ConvSpec, Upsampling, conv_backward, conv_forward, upsample_2x,
-    upsample_2x_backward,
+    ConvShape, ConvSpec, Upsampling, conv_backward, conv_forward, upsample_2x, upsample_2x_backward,
 };
+use crate::portable;
 use burn::backend::autodiff::checkpoint::base::Checkpointer;
 use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
 use burn::backend::autodiff::grads::Gradients;
@@ -209,6 +210,9 @@ pub fn conv(x: Tensor<4>, weight: Tensor<4>, bias: Tensor<1>, spec: ConvSpec) ->
         weight.dims(),
         spec.groups
     );
+    if !has_kernels(&x.device()) {
+        return portable::conv(x, weight, bias, spec);
+    }
     Tensor::from_dispatch(Dispatch::sixfold_conv(
         x.into_dispatch(),
         weight.into_dispatch(),
@@ -219,13 +223,20 @@ pub fn conv(x: Tensor<4>, weight: Tensor<4>, bias: Tensor<1>, spec: ConvSpec) ->
 
 /// Upsamples an image by two, repeating pixels: `batch x channels x height x width` to twice the rows and columns.
 pub fn upsample(x: Tensor<4>) -> Tensor<4> {
-    Tensor::from_dispatch(Dispatch::sixfold_upsample(x.into_dispatch(), Upsampling::Repeated))
+    upsampled(x, Upsampling::Repeated)
 }
 
 /// Upsamples an image by two bilinearly, as PyTorch's `interpolate` without aligned corners: `batch x channels x height x width` to
 /// twice the rows and columns.
 pub fn doubled(x: Tensor<4>) -> Tensor<4> {
-    Tensor::from_dispatch(Dispatch::sixfold_upsample(x.into_dispatch(), Upsampling::Bilinear))
+    upsampled(x, Upsampling::Bilinear)
+}
+
+fn upsampled(x: Tensor<4>, kind: Upsampling) -> Tensor<4> {
+    if !has_kernels(&x.device()) {
+        return portable::upsample(x, kind);
+    }
+    Tensor::from_dispatch(Dispatch::sixfold_upsample(x.into_dispatch(), kind))
 }
 
 /// Rearranges channels to pixels: `batch x (factor * factor * c) x h x w` to `batch x c x (factor * h) x (factor * w)` (Shi et al.
@@ -242,13 +253,4 @@ pub fn pixel_shuffle(x: Tensor<4>, factor: usize) -> Tensor<4> {
         factor * height,
         factor * width,
     ])
-}
-
-/// The activation as a tensor operation, for reference in tests.
-pub fn apply_activation(x: Tensor<4>, activation: Activation) -> Tensor<4> {
-    match activation {
-        Activation::Linear => x,
-        Activation::Relu => x.clamp_min(0.0),
-        Activation::Relu6 => x.clamp(0.0, 6.0),
-    }
 }

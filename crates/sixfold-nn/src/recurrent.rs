@@ -12,7 +12,9 @@ use burn::backend::{Autodiff, Backend, Dispatch, Flex, TensorMetadata, backend_e
 use burn::tensor::{DType, Shape, Tensor};
 use burn_flex::{FlexTensor, Layout};
 
+use crate::device::has_kernels;
 use crate::kernels::{Places, gather_backward, gather_forward, lstm_backward, lstm_forward};
+use crate::portable;
 
 /// Operations that this file adds to a backend.
 #[backend_extension(Flex, Autodiff)]
@@ -176,6 +178,9 @@ impl<B: RecurrentOps, C: CheckpointStrategy> RecurrentOps for Autodiff<B, C> {
 pub fn lstm_cell(gates: Tensor<4>, before: Tensor<4>) -> (Tensor<4>, Tensor<4>) {
     let ([batch, all, height, width], shape) = (gates.dims(), before.dims());
     assert_eq!([batch, all, height, width], [shape[0], 4 * shape[1], shape[2], shape[3]], "gates of an LSTM");
+    if !has_kernels(&gates.device()) {
+        return portable::lstm_cell(gates, before);
+    }
     let out =
         Tensor::<4>::from_dispatch(Dispatch::sixfold_lstm(gates.into_dispatch(), before.into_dispatch()));
     (out.clone().narrow(0, 0, batch), out.narrow(0, batch, batch))
@@ -187,5 +192,8 @@ pub fn lstm_cell(gates: Tensor<4>, before: Tensor<4>) -> (Tensor<4>, Tensor<4>) 
 /// If positions are missing for some image, or a position's pixel is outside.
 pub fn gather(maps: Tensor<4>, places: Arc<Places>) -> Tensor<4> {
     assert_eq!(maps.dims()[0], places.images.len(), "places for every map");
+    if !has_kernels(&maps.device()) {
+        return portable::gather(maps, &places);
+    }
     Tensor::from_dispatch(Dispatch::sixfold_gather(maps.into_dispatch(), places))
 }

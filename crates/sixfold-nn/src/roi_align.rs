@@ -11,7 +11,9 @@ use burn::backend::{Autodiff, Backend, Dispatch, Flex, TensorMetadata, backend_e
 use burn::tensor::{DType, Shape, Tensor};
 use burn_flex::{FlexTensor, Layout};
 
+use crate::device::has_kernels;
 use crate::kernels::{Regions, roi_align_backward, roi_align_forward};
+use crate::portable;
 
 /// RoIAlign for a backend.
 #[backend_extension(Flex, Autodiff)]
@@ -110,7 +112,11 @@ pub fn roi_align(map: Tensor<4>, regions: Regions) -> Tensor<4> {
         regions.side,
         regions.samples
     );
-    Tensor::from_dispatch(Dispatch::sixfold_roi_align(map.into_dispatch(), Arc::new(regions)))
+    let regions = Arc::new(regions);
+    if !has_kernels(&map.device()) {
+        return portable::roi_align(map, &regions);
+    }
+    Tensor::from_dispatch(Dispatch::sixfold_roi_align(map.into_dispatch(), regions))
 }
 
 #[cfg(test)]

@@ -1,13 +1,12 @@
 //! The fused convolution against Burn's own, values and gradients, for every kind of layer that the networks use.
 
-use burn::tensor::module::conv2d;
-use burn::tensor::ops::ConvOptions;
 use burn::tensor::{Device, Tensor, TensorData};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use sixfold_nn::kernels::{Activation, ConvSpec};
 use sixfold_nn::layers::normal;
-use sixfold_nn::ops::{apply_activation, conv, upsample};
+use sixfold_nn::ops::{conv, upsample};
+use sixfold_nn::portable;
 
 fn random<const D: usize>(shape: [usize; D], rng: &mut ChaCha8Rng, device: &Device) -> Tensor<D> {
     let values: Vec<f32> = (0..shape.iter().product::<usize>()).map(|_| normal(rng)).collect();
@@ -17,14 +16,6 @@ fn random<const D: usize>(shape: [usize; D], rng: &mut ChaCha8Rng, device: &Devi
 fn largest_difference<const D: usize>(a: Tensor<D>, b: Tensor<D>) -> f32 {
     assert_eq!(a.dims(), b.dims());
     (a - b).abs().max().into_scalar::<f32>()
-}
-
-/// Burn's convolution has symmetric padding: pad by hand first.
-fn reference(x: Tensor<4>, weight: Tensor<4>, bias: Tensor<1>, spec: ConvSpec) -> Tensor<4> {
-    let [before, after] = spec.padding;
-    let x = x.pad((before, after, before, after), 0.0);
-    let options = ConvOptions::new([spec.stride; 2], [0, 0], [1, 1], spec.groups);
-    apply_activation(conv2d(x, weight, Some(bias), options), spec.activation)
 }
 
 #[test]
@@ -60,7 +51,7 @@ fn values_and_gradients_equal_burns_own() {
         let bias = random([outputs], &mut rng, &device).require_grad();
 
         let ours = conv(x.clone(), weight.clone(), bias.clone(), spec);
-        let theirs = reference(x.clone(), weight.clone(), bias.clone(), spec);
+        let theirs = portable::conv(x.clone(), weight.clone(), bias.clone(), spec);
         let scale = theirs.clone().abs().max().into_scalar::<f32>();
         let error = largest_difference(ours.clone().inner(), theirs.clone().inner());
         assert!(error < 1e-5 * scale, "{case:?}: values differ by {error}");

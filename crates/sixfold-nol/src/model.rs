@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use rayon::prelude::*;
+use sixfold_nn::device;
 use sixfold_nn::weights::{
     ModelCard, WeightsError, load_weights, load_weights_from_bytes, read_card, save_weights,
     write_card_markdown,
@@ -72,7 +73,7 @@ impl NolModel {
         }
         extra["parts"] = serde_json::to_value(parts).unwrap_or_default();
         let card = ModelCard { architecture: network.architecture().to_owned(), extra, ..card };
-        NolModel { network: network.valid(), card, device: Device::flex() }
+        NolModel { network: network.valid(), card, device: device::chosen() }
     }
 
     /// Reads a weight file.
@@ -83,7 +84,7 @@ impl NolModel {
         let card = read_card(path)?;
         let network = Self::described(path, &card)?;
         let (network, card) = load_weights(network, path, &card.architecture)?;
-        Ok(NolModel { network: network.valid(), card, device: Device::flex() })
+        Ok(NolModel { network: network.valid(), card, device: device::chosen() })
     }
 
     /// Reads a compact model with all its parts from the bytes of a weight file; `name` is used in messages.
@@ -91,7 +92,7 @@ impl NolModel {
     /// # Errors
     /// [`ModelError`].
     pub fn from_bytes(name: &Path, bytes: &[u8]) -> Result<Self, ModelError> {
-        let (device, compact) = (Device::flex(), "nol-compact");
+        let (device, compact) = (device::chosen(), "nol-compact");
         let network = Network::of_architecture(compact, Parts::default(), &device)?
             .unwrap_or_else(|| unreachable!("the compact network is known"));
         let (network, card) = load_weights_from_bytes(network, name, bytes, compact)?;
@@ -111,7 +112,7 @@ impl NolModel {
             |field, expected, found| ModelError::Card { file: path.to_path_buf(), field, expected, found };
         let parts: Parts = serde_json::from_value(card.extra["parts"].clone())
             .map_err(|e| wrong("extra.parts", "the network's parts", e.to_string()))?;
-        Network::of_architecture(&card.architecture, parts, &Device::flex())?
+        Network::of_architecture(&card.architecture, parts, &device::chosen())?
             .ok_or_else(|| wrong("architecture", "nol-compact or nol-paper", card.architecture.clone()))
     }
 

@@ -2,12 +2,13 @@
 
 use std::path::Path;
 
-use burn::tensor::{Device, Tensor};
+use burn::tensor::Tensor;
 use sixfold_synth::augment::Backgrounds;
 
 use crate::network::{COLOURS, Network};
 use crate::samples::{Batch, ViewSampleOptions, make_sample};
 use crate::training::pass;
+use sixfold_nn::device;
 
 /// Rows of the image, and sources in each.
 const ROWS: u64 = 5;
@@ -30,7 +31,7 @@ impl Preview {
     /// Writes an image with sources, the true target, the sources' average, X^D and X^phi to `folder`. A failure to write it does
     /// not stop the training.
     pub(crate) fn draw(&self, network: &Network, folder: &Path) {
-        let passed = pass(network, self.batch.clone(), &Device::flex());
+        let passed = pass(network, self.batch.clone(), &device::chosen());
         let plain = |t: Tensor<4>| -> Vec<f32> { t.into_data().try_to_vec().unwrap_or_default() };
         let (average, _) = self.batch.average();
         let images = [

@@ -2,8 +2,9 @@
 
 use std::collections::BTreeMap;
 
-use burn::tensor::{Device, Tensor, TensorData};
+use burn::tensor::{Tensor, TensorData};
 use serde::Serialize;
+use sixfold_nn::device;
 use sixfold_nn::lite0::imagenet_encoder;
 use sixfold_nn::weights::WeightsError;
 use sixfold_synth::augment::Backgrounds;
@@ -84,7 +85,7 @@ pub fn quality(
     samples: &ViewSampleOptions,
     options: &QualityOptions,
 ) -> Result<Quality, WeightsError> {
-    let perceptual = Perceptual::Lite0(Box::new(imagenet_encoder(&Device::flex())?));
+    let perceptual = Perceptual::Lite0(Box::new(imagenet_encoder(&device::chosen())?));
     let rough = ViewSampleOptions { good_poses: 0.0, ..*samples };
     let exact = ViewSampleOptions { translation: 0.0, rotation: 0.0, ..*samples };
     let [rough, exact] = [rough, exact].map(|samples| {
@@ -122,7 +123,7 @@ fn compare(
         mask[at] = f32::from(u8::from(rendering.seen[i]));
     }
     let tensor = |values: Vec<f32>, channels: usize| {
-        Tensor::<4>::from_data(TensorData::new(values, [1, channels, side, side]), &Device::flex())
+        Tensor::<4>::from_data(TensorData::new(values, [1, channels, side, side]), &device::chosen())
     };
     let (truth, mask) = (tensor(batch.target.clone(), COLOURS), tensor(mask, 1));
     [image, batch.average().0].map(|image| {
@@ -131,4 +132,22 @@ fn compare(
         let (_, features) = image_loss(image, truth.clone(), mask.clone(), perceptual);
         TruthSimilarity { psnr: psnr(f64::from(error)), features: f64::from(features.into_scalar::<f32>()) }
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Weights that were exchanged by mistake, or a change of the renderer that they do not fit, fail here.
+    #[test]
+    fn the_shipped_network_is_nearer_to_the_truth_than_the_average_of_the_sources() {
+        let model = NolModel::shipped().unwrap();
+        let options = QualityOptions { objects: 8, ..QualityOptions::default() };
+        let quality =
+            quality(&model, &Backgrounds::procedural(), &ViewSampleOptions::default(), &options).unwrap();
+        println!("{quality:?}");
+        assert!(quality.rough.features < 0.97 * quality.rough_average.features, "{quality:?}");
+        assert!(quality.exact.features < 0.94 * quality.exact_average.features, "{quality:?}");
+        assert!(quality.exact.psnr > quality.exact_average.psnr, "{quality:?}");
+    }
 }

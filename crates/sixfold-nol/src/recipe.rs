@@ -3,9 +3,9 @@
 
 use std::path::PathBuf;
 
-use burn::tensor::Device;
 use sixfold_data::background_files;
 use sixfold_nn::choice::Choice;
+use sixfold_nn::device;
 use sixfold_nn::fingerprint::Fingerprint;
 use sixfold_nn::options::OptionError;
 use sixfold_nn::recipe::{Prepared, Recipe, Session};
@@ -143,7 +143,7 @@ impl Recipe for NolRecipe {
     }
 
     fn prepare(&self, _: (), _: &mut Session<'_>) -> Result<Prepared<NolTraining, Backgrounds>, TrainError> {
-        let device = Device::flex().autodiff();
+        let device = device::chosen().autodiff();
         let parts = self.parts;
         let network = match (self.network, &self.encoder) {
             (NolKind::Compact, _) => Network::Compact(CompactConfig { parts }.init(self.seed, &device)?),

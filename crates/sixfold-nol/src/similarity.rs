@@ -6,6 +6,7 @@
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
 use sixfold_geometry::Mask;
+use sixfold_nn::device;
 use sixfold_nn::lite0::{Lite0, imagenet_encoder};
 use sixfold_nn::weights::WeightsError;
 use sixfold_synth::augment::Patch;
@@ -212,7 +213,7 @@ impl ImageSimilarity {
     /// # Errors
     /// [`WeightsError`] if the shipped encoder has another version than the program.
     pub fn new() -> Result<Self, WeightsError> {
-        let device = Device::flex();
+        let device = device::chosen();
         Ok(ImageSimilarity { encoder: imagenet_encoder(&device)?, device })
     }
 

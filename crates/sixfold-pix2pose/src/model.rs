@@ -8,6 +8,7 @@ use crate::object::{Correction, ObjectEntry};
 use burn::module::Module;
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::{Deserialize, Serialize};
+use sixfold_nn::device;
 use sixfold_nn::weights::{
     ModelCard, WeightsError, load_weights, read_card, save_weights, write_card_markdown,
 };
@@ -141,7 +142,7 @@ impl Pix2PoseModel {
             extra,
             ..card
         };
-        Self { network: network.for_inference(), objects, sizes, card, device: Device::flex() }
+        Self { network: network.for_inference(), objects, sizes, card, device: device::chosen() }
     }
 
     /// The same with another card; its objects and sizes must be those of this model.
@@ -151,7 +152,7 @@ impl Pix2PoseModel {
 
     /// Reads a weight file.
     pub fn load(path: &Path) -> Result<Self, ModelError> {
-        let device = Device::flex();
+        let device = device::chosen();
         let card = read_card(path)?;
         let (objects, sizes) = described(path, &card)?;
         let (network, card) = match card.architecture.as_str() {

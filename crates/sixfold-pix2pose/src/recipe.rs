@@ -8,6 +8,7 @@ use burn::tensor::Device;
 use sixfold_align::outline::outline_mesh;
 use sixfold_mesh::{Mesh, ModelInfo};
 use sixfold_nn::choice::Choice;
+use sixfold_nn::device;
 use sixfold_nn::fingerprint::Fingerprint;
 use sixfold_nn::learner::Checkpointed;
 use sixfold_nn::lite0::imagenet_encoder;
@@ -413,7 +414,7 @@ impl Recipe for Pix2PoseRecipe {
         let fits = compact || objects.len() == 1;
         OptionError::unless(fits, "network", self.described(objects.len()), DISSERTATION)?;
         let (objects, description) = self.objects(objects, description, session)?;
-        let training = self.training(&objects, Device::flex().autodiff())?;
+        let training = self.training(&objects, device::chosen().autodiff())?;
         let card = self.card(description, &frames)?;
         let context = Context {
             entries: objects.iter().map(|o| self.entry(o)).collect(),

@@ -6,6 +6,7 @@ use burn::module::Module;
 use burn::tensor::activation::sigmoid;
 use burn::tensor::{Device, Tensor, TensorData};
 use sixfold_grasp::learned::{CHANNELS, ClosingRegion, SIDE};
+use sixfold_nn::device;
 use sixfold_nn::weights::{
     ModelCard, WeightsError, load_weights, load_weights_from_bytes, save_weights, write_card_markdown,
 };
@@ -37,7 +38,7 @@ impl GpdModel {
     /// # Panics
     /// Never: a test reads it.
     pub fn shipped() -> Self {
-        let network = GpdConfig.init(0, &Device::flex());
+        let network = GpdConfig.init(0, &device::chosen());
         let name = Path::new("gpd-compact.safetensors");
         let (network, card) = load_weights_from_bytes(network, name, SHIPPED, ARCHITECTURE)
             .unwrap_or_else(|error| unreachable!("the shipped planner: {error}"));
@@ -49,7 +50,7 @@ impl GpdModel {
     /// # Errors
     /// [`WeightsError`].
     pub fn load(path: &Path) -> Result<Self, WeightsError> {
-        let (network, card) = load_weights(GpdConfig.init(0, &Device::flex()), path, ARCHITECTURE)?;
+        let (network, card) = load_weights(GpdConfig.init(0, &device::chosen()), path, ARCHITECTURE)?;
         Ok(GpdModel { network: network.valid(), card })
     }
 
@@ -69,7 +70,7 @@ impl GpdModel {
 
     /// Success probabilities of candidates, 0 to 1.
     pub fn scores(&self, regions: &[ClosingRegion]) -> Vec<f64> {
-        let device = Device::flex();
+        let device = device::chosen();
         let of_batch = |batch: &[ClosingRegion]| {
             let logits = self.network.forward(tensor(batch.iter(), batch.len(), &device));
             let scores: Vec<f32> = sigmoid(logits)

@@ -3,11 +3,11 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use burn::tensor::Device;
 use serde::Serialize;
 use sixfold_grasp::learned::{ClosingRegion, HafModel, HeightGrid, write_haf};
 use sixfold_grasp::{Grasp, GraspView, Gripper};
 use sixfold_io::write_atomically;
+use sixfold_nn::device;
 use sixfold_nn::fingerprint::Fingerprint;
 use sixfold_nn::options::{OptionError, TrainingOptions};
 use sixfold_nn::recipe::{Prepared, Recipe, Session, TrainingEvent};
@@ -162,7 +162,7 @@ impl Recipe for GpdRecipe {
     }
 
     fn prepare(&self, _: (), _: &mut Session<'_>) -> Result<Prepared<GpdTraining, GpdContext>, TrainError> {
-        let device = Device::flex().autodiff();
+        let device = device::chosen().autodiff();
         let network = GpdConfig.init(self.common.seed, &device);
         let training = GpdTraining::new(network, self.options(), device);
         let mut card = self.common.card("GPD, success probability of a grasp");

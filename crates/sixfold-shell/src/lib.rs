@@ -29,6 +29,7 @@ pub mod objects;
 pub mod output;
 pub mod overlay;
 pub mod pictures;
+pub mod processor;
 pub mod progress;
 pub mod ranges;
 #[cfg(feature = "physics")]
@@ -41,7 +42,6 @@ pub mod teachings;
 #[cfg(feature = "networks")]
 pub mod training;
 
-use std::num::NonZeroUsize;
 use std::process::ExitCode;
 
 /// The error message of a program built without the feature `networks`.
@@ -104,13 +104,5 @@ impl PixelLimit {
         if let Some(pixels) = self.max_pixels {
             sixfold_io::set_max_pixels(pixels.get());
         }
-    }
-}
-
-/// Uses this number of threads for everything, or all cores.
-pub fn use_threads(threads: Option<NonZeroUsize>) {
-    if let Some(threads) = threads {
-        // Fails only when a pool exists already, and none does.
-        let _ = rayon::ThreadPoolBuilder::new().num_threads(threads.get()).build_global();
     }
 }

@@ -3,7 +3,6 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use burn::tensor::Device;
 use serde_json::{Map, json};
 use sixfold_align::outline::outline_mesh;
 use sixfold_estimator::{
@@ -12,6 +11,7 @@ use sixfold_estimator::{
 };
 use sixfold_io::Fnv1a;
 use sixfold_mesh::Mesh;
+use sixfold_nn::device;
 use sixfold_nn::lite0::imagenet_encoder_hash;
 
 use crate::error::ViewsError;
@@ -52,7 +52,7 @@ impl ViewsEstimator {
     /// # Errors
     /// [`ViewsError::Weights`].
     pub fn shipped() -> Result<ViewsEstimator, ViewsError> {
-        let device = Device::default();
+        let device = device::chosen();
         let refiner = Refiner::new(RefinerNetwork::shipped(&device)?, device);
         let estimator = ViewsEstimator::new(Extractor::shipped()?, shipped_hash());
         Ok(ViewsEstimator { refiner: Some(Arc::new(refiner)), ..estimator })
@@ -64,7 +64,7 @@ impl ViewsEstimator {
     /// # Errors
     /// [`ViewsError::Weights`].
     pub fn load(weights: &Path) -> Result<ViewsEstimator, ViewsError> {
-        let device = Device::default();
+        let device = device::chosen();
         let (network, _) = ViewNetwork::load(weights, &device)?;
         let hash = sixfold_io::fnv1a_of_file(weights)
             .map_err(|source| ViewsError::Read { file: weights.to_owned(), source })?;

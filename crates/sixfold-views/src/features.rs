@@ -3,6 +3,7 @@
 use std::borrow::Borrow;
 
 use burn::tensor::{Device, Tensor, TensorData};
+use sixfold_nn::device;
 use sixfold_nn::xfeat::{CELL, CHANNELS};
 
 use crate::error::ViewsError;
@@ -42,7 +43,7 @@ impl Extractor {
     /// # Errors
     /// [`ViewsError::Weights`].
     pub fn shipped() -> Result<Extractor, ViewsError> {
-        let device = Device::default();
+        let device = device::chosen();
         Extractor::new(ViewNetwork::shipped(&device)?, device)
     }
 

@@ -2,7 +2,6 @@
 
 use std::sync::Arc;
 
-use burn::tensor::Device;
 use sixfold_align::outline::{outline_mesh, projected_box};
 use sixfold_estimator::{EstimatorError, PoseRefiner, RefinedObject, RefinedPose};
 use sixfold_geometry::{Camera, Pose, RgbImage};
@@ -14,6 +13,7 @@ use crate::features::Extractor;
 use crate::refiner::Refiner;
 use crate::refiner::network::RefinerNetwork;
 use crate::templates::view_mesh;
+use sixfold_nn::device;
 
 /// Refines poses of any object with a mesh, by the networks that refine those of
 /// [`ViewsEstimator`](crate::estimator::ViewsEstimator).
@@ -31,7 +31,7 @@ impl ViewsRefiner {
     /// # Errors
     /// [`ViewsError::Weights`].
     pub fn shipped() -> Result<ViewsRefiner, ViewsError> {
-        let device = Device::default();
+        let device = device::chosen();
         let refiner = Arc::new(Refiner::new(RefinerNetwork::shipped(&device)?, device));
         Ok(ViewsRefiner {
             extractor: Arc::new(Extractor::shipped()?),

@@ -3,8 +3,8 @@
 
 use std::path::{Path, PathBuf};
 
-use burn::tensor::Device;
 use sixfold_data::background_files;
+use sixfold_nn::device;
 use sixfold_nn::fingerprint::Fingerprint;
 use sixfold_nn::options::OptionError;
 use sixfold_nn::recipe::{Prepared, Recipe, Session};
@@ -83,7 +83,7 @@ impl Recipe for ViewsRecipe {
         (): (),
         _: &mut Session<'_>,
     ) -> Result<Prepared<ViewsTraining, Backgrounds>, TrainError> {
-        let device = Device::flex().autodiff();
+        let device = device::chosen().autodiff();
         let network = ViewNetwork::untrained(&device)?;
         let textures = textures(self.backgrounds.as_deref())?;
         let mut card = ModelCard::new(ARCHITECTURE, "Views, features of known objects in colour images");

@@ -3,6 +3,7 @@
 //! material a part shows.
 
 use burn::tensor::{Device, Tensor, TensorData};
+use sixfold_nn::device;
 use sixfold_nn::lite0::{Lite0, imagenet_encoder};
 
 use sixfold_align::outline::projected_box;
@@ -60,7 +61,7 @@ impl Recogniser {
     /// # Errors
     /// [`ViewsError::Weights`].
     pub fn shipped() -> Result<Recogniser, ViewsError> {
-        let device = Device::default();
+        let device = device::chosen();
         Ok(Recogniser { network: imagenet_encoder(&device)?, device })
     }
 

@@ -122,6 +122,10 @@ fn counts_out_of_range_and_ids_named_twice_are_refused() {
     let bad = |arguments: &str, words: &[&str]| fails(one.path(), arguments, words);
     bad("object list --threads 100000", &["--threads", "100000", "1 to 1024"]);
     bad("object list --threads 0", &["--threads", "1 to 1024"]);
+    bad("object list --device tpu", &["--device", "tpu", "cpu or gpu"]);
+    if !cfg!(feature = "gpu") {
+        bad("object list --device gpu", &["--device gpu", "feature `gpu`", "cpu"]);
+    }
     bad("eval --dataset tiny --results a.csv --min-score nan", &["--min-score", "NaN", "0 to 1"]);
     bad("eval --dataset tiny --results a.csv --min-score 2", &["--min-score", "2", "0 to 1"]);
     bad(&format!("{} --instances 100000", OneImage::ARGUMENTS), &["--instances", "100000", "1 to 1000"]);

@@ -31,11 +31,15 @@ fn lmo() -> Option<PathBuf> {
 /// Writes every eighth of the frames that were not used for training as a file of targets; returns the number of targets.
 fn every_eighth(lmo: &Path, weights: &Path, file: &Path) -> usize {
     let card = read_card(weights).unwrap();
-    let trained: BTreeSet<(u32, u32)> =
-        card.training_frames.iter().flatten().map(|f| (f.scene_id, f.im_id)).collect();
+    let trained = card.training_frames.iter().flatten().map(|f| (f.scene_id, f.im_id)).collect();
+    every(8, lmo, &trained, file)
+}
+
+/// Writes every so many of the frames that are not left out as a file of targets; returns the number of targets.
+fn every(step: usize, lmo: &Path, left_out: &BTreeSet<(u32, u32)>, file: &Path) -> usize {
     let targets = BopDataset::open(lmo, "test").unwrap().targets(None).unwrap();
     let frames: BTreeSet<(u32, u32)> = targets.iter().map(|t| (t.scene_id, t.im_id)).collect();
-    let chosen: Vec<(u32, u32)> = frames.difference(&trained).copied().step_by(8).collect();
+    let chosen: Vec<(u32, u32)> = frames.difference(left_out).copied().step_by(step).collect();
     let rows: Vec<Value> = targets
         .iter()
         .filter(|t| chosen.contains(&(t.scene_id, t.im_id)))
@@ -78,6 +82,19 @@ fn the_shipped_pix2pose_on_real_frames() {
     let (scores, kept) = (sixfold(dir.path(), &eval).expect(0).json(), kept("pix2pose"));
     assert_eq!((&scores["targets"], &kept["targets"]), (&count.into(), &count.into()));
     assert_kept(&scores, &kept, &["/ar_mssd", "/ar_mspd", "/add_s_recall/mean"], count);
+}
+
+/// Nothing is trained for these objects; a tenth of the images, so that the standard error is larger.
+#[test]
+fn views_in_boxes_on_real_frames() {
+    let Some(lmo) = lmo() else { return };
+    let dir = tempfile::tempdir().unwrap();
+    let count = every(20, &lmo, &BTreeSet::new(), &dir.path().join("targets.json"));
+    let data = format!("--dataset {} --targets targets.json", lmo.display());
+    sixfold(dir.path(), &format!("estimate --method views {data} --boxes gt --out r.csv")).expect(0);
+    let scores =
+        sixfold(dir.path(), &format!("eval {data} --results r.csv --no-vsd --json")).expect(0).json();
+    assert_kept(&scores, &kept("views"), &["/ar_mssd", "/ar_mspd", "/add_s_recall/mean"], count);
 }
 
 #[test]

@@ -5,6 +5,7 @@ use std::path::Path;
 
 use burn::module::Module;
 use burn::tensor::Device;
+use sixfold_nn::device;
 use sixfold_nn::pretrained::{Naming, PretrainedError, PretrainedFile, fill};
 use sixfold_nn::resnet::Bottlenecks;
 
@@ -144,7 +145,7 @@ impl AnchoredNetwork {
         let file = PretrainedFile::open(path)?;
         let Some(mut config) = Shapes(&file).config() else { return Ok(None) };
         change(&mut config);
-        AnchoredNetwork::from_pytorch(&file, &config, &Device::flex()).map(Some)
+        AnchoredNetwork::from_pytorch(&file, &config, &device::chosen()).map(Some)
     }
 }
 

@@ -8,6 +8,7 @@ use burn::optim::GradientsParams;
 use burn::tensor::{Device, Tensor, TensorData};
 use serde::Serialize;
 use sixfold_geometry::random::{Random, stream};
+use sixfold_nn::device;
 use sixfold_nn::kernels::{Regions, roi_align_forward};
 use sixfold_nn::learner::{Checkpointed, Learner};
 use sixfold_nn::options::{OptionError, Pace};
@@ -256,7 +257,7 @@ impl AnchoredTraining {
 
     /// The trained network.
     pub fn into_network(self) -> AnchoredNetwork {
-        AnchoredNetwork::of_layers(self.learner.into_network(), self.config, Device::flex())
+        AnchoredNetwork::of_layers(self.learner.into_network(), self.config, device::chosen())
     }
 
     /// One image through the network and back. `network` is this thread's own copy, as graphs that share parameters are one to Burn.

@@ -12,6 +12,9 @@ use burn::backend::{Autodiff, AutodiffBackend, Backend, Dispatch, Flex, TensorMe
 use burn::tensor::{DType, Shape, Tensor};
 use burn_flex::{FlexTensor, Layout};
 
+use crate::device::has_kernels;
+use crate::portable;
+
 use super::NormOptions;
 use super::kernel::{Forward, Planes, Statistics, backward, forward};
 
@@ -221,6 +224,9 @@ pub(super) fn batch_norm(
             residual.dims(),
             "batch normalisation: the residual must have the input's shape"
         );
+    }
+    if !has_kernels(&device) {
+        return portable::batch_norm(x, [weight, bias], residual, given, options);
     }
     let residual = residual.unwrap_or_else(|| Tensor::zeros([0, 1, 1, 1], &device));
     let [mean, variance] =

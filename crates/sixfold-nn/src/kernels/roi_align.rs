@@ -77,6 +77,27 @@ impl Regions {
         }
         Grid { samples, per_bin: rows * columns }
     }
+
+    /// Every bin as a weighted sum of the map's pixels, term by term: of all bins the pixel and its weight. Boxes with fewer samples
+    /// have terms of weight 0.
+    pub(crate) fn terms(&self, size: [usize; 2]) -> Vec<(Vec<i32>, Vec<f32>)> {
+        let grids: Vec<Grid> = self.boxes.iter().map(|b| self.grid(b, size)).collect();
+        let per_bin = grids.iter().map(|g| g.per_bin).max().unwrap_or(0);
+        let bins = self.side * self.side;
+        let mut terms = vec![(vec![0; grids.len() * bins], vec![0.0; grids.len() * bins]); 4 * per_bin];
+        for (number, grid) in grids.iter().enumerate() {
+            for (bin, samples) in grid.samples.chunks_exact(grid.per_bin).enumerate() {
+                for (i, sample) in samples.iter().enumerate() {
+                    for (j, (at, weight)) in sample.at.into_iter().zip(sample.weights).enumerate() {
+                        let (pixels, weights) = &mut terms[4 * i + j];
+                        pixels[number * bins + bin] = at as i32;
+                        weights[number * bins + bin] = weight / grid.per_bin as f32;
+                    }
+                }
+            }
+        }
+        terms
+    }
 }
 
 /// Computes `boxes x channels x side x side` from a map of `channels x size`.

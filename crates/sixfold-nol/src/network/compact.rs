@@ -54,7 +54,7 @@ impl CompactConfig {
             }),
         };
         Ok(Compact {
-            encoder: imagenet_encoder(&Device::flex())?,
+            encoder: imagenet_encoder(&device.clone().inner())?,
             reduce,
             norm,
             head: head.init(rng, device),

@@ -3,8 +3,8 @@
 
 use std::path::PathBuf;
 
-use burn::tensor::Device;
 use sixfold_data::background_files;
+use sixfold_nn::device;
 use sixfold_nn::fingerprint::Fingerprint;
 use sixfold_nn::options::OptionError;
 use sixfold_nn::recipe::{Prepared, Recipe, Session, continued_from};
@@ -71,7 +71,7 @@ impl Recipe for RefinerRecipe {
         (): (),
         _: &mut Session<'_>,
     ) -> Result<Prepared<RefinerTraining, Backgrounds>, TrainError> {
-        let device = Device::flex().autodiff();
+        let device = device::chosen().autodiff();
         let network = match &self.init {
             Some(path) => RefinerNetwork::load(path, &device)?.0,
             None => RefinerNetwork::random(self.seed(), &device),
