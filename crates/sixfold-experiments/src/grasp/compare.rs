@@ -16,7 +16,7 @@ use sixfold_simulation::{
     wilson_interval_of_fraction,
 };
 
-use super::ways::{METHODS, Ways};
+use super::ways::{METHODS, RULES, Ways};
 use sixfold_shell::Outcome;
 use sixfold_shell::grasp::experience::{NetworkArguments, memory, model, store_place};
 use sixfold_shell::grasp::journal::Journal;
@@ -48,6 +48,9 @@ pub(crate) struct CompareArguments {
     /// --hard: without errors all tries are the same)
     #[arg(long, value_name = "N", default_value = "1")]
     pub tries: usize,
+    /// Compare DGCM-Net in the published form with itself, one of its rules at a time replaced by ours, instead of the planners
+    #[arg(long)]
+    pub published_rules: bool,
     #[command(flatten)]
     pub physics: PhysicsArguments,
     #[command(flatten)]
@@ -102,7 +105,7 @@ struct Recorded<'a> {
     planners: [String; 2],
     experiences: usize,
     outcomes: usize,
-    methods: [&'a str; METHODS.len()],
+    methods: &'a [&'a str],
     gripper: &'a Gripper,
     mass: f64,
 }
@@ -118,7 +121,9 @@ pub(crate) struct Whole {
     friction: f64,
     mass: f64,
     pub classes: Vec<Class>,
-    pub median_seconds: [f64; METHODS.len()],
+    /// In the order of the methods.
+    pub median_seconds: Vec<f64>,
+    methods: &'static [&'static str],
 }
 
 #[derive(Serialize)]
@@ -126,9 +131,9 @@ pub(crate) struct Class {
     pub class: String,
     pub trials: usize,
     /// In the order of the methods.
-    pub rates: [f64; METHODS.len()],
+    pub rates: Vec<f64>,
     /// Wilson intervals, 95 %.
-    pub intervals: [(f64, f64); METHODS.len()],
+    pub intervals: Vec<(f64, f64)>,
 }
 
 pub(crate) fn run(a: &CompareArguments) -> Result<Outcome> {
@@ -141,6 +146,12 @@ pub(crate) fn run(a: &CompareArguments) -> Result<Outcome> {
     } else {
         Outcome::NothingFound
     })
+}
+
+impl CompareArguments {
+    fn methods(&self) -> &'static [&'static str] {
+        if self.published_rules { &RULES } else { &METHODS }
+    }
 }
 
 /// Runs the comparison, or resumes it.
@@ -172,12 +183,12 @@ pub(crate) fn compare(a: &CompareArguments) -> Result<Whole> {
         planners: planners.each_ref().map(Planner::fingerprint),
         experiences: memory.len(),
         outcomes: memory.outcomes(&gripper.name).attempts,
-        methods: METHODS,
+        methods: a.methods(),
         gripper: real,
         mass: options.trial.mass,
     };
     let file = a.out.join("trials.jsonl");
-    let (mut journal, mut rows) = Journal::open_groups::<Row>(&file, &recorded, METHODS.len())?;
+    let (mut journal, mut rows) = Journal::open_groups::<Row>(&file, &recorded, recorded.methods.len())?;
     let mut progress = Progress::new("scenes", objects.len() * a.trials as usize);
     let ways = Ways { gripper, network: &network, planners: &planners };
     let scenes = Scenes { a, setting: &setting, options, ways };
@@ -205,13 +216,9 @@ pub(crate) fn compare(a: &CompareArguments) -> Result<Whole> {
         outcomes: memory.outcomes(&gripper.name).attempts,
         friction: real.friction,
         mass: options.trial.mass,
-        classes: classes(&rows, a.tries),
-        median_seconds: METHODS.map(|m| {
-            let mut seconds: Vec<f64> =
-                rows.iter().filter(|r| r.method == m && r.counts).map(|r| r.seconds).collect();
-            seconds.sort_by(f64::total_cmp);
-            seconds.get(seconds.len() / 2).copied().unwrap_or(0.0)
-        }),
+        classes: classes(&rows, a.tries, a.methods()),
+        median_seconds: a.methods().iter().map(|m| median_seconds(&rows, m)).collect(),
+        methods: a.methods(),
     };
     write_atomically(&a.out.join("table.json"), serde_json::to_string_pretty(&whole)?.as_bytes())?;
     Ok(whole)
@@ -250,10 +257,15 @@ impl Scenes<'_> {
             seconds: scene.seconds,
             trial_seconds: 0.0,
         };
-        let rows = METHODS.map(|m| Row { method: m.to_owned(), ..empty.clone() });
-        let (Some(view), Some(seen)) = (&scene.view, &scene.seen) else { return Ok(rows.to_vec()) };
+        let methods = self.a.methods().iter();
+        let rows: Vec<Row> = methods.map(|&m| Row { method: m.to_owned(), ..empty.clone() }).collect();
+        let (Some(view), Some(seen)) = (&scene.view, &scene.seen) else { return Ok(rows) };
         let planner = AntipodalOptions { seed: scene.noise, ..self.options.planner };
-        let answers = self.ways.answers(view, &planner, memory)?;
+        let answers = if self.a.published_rules {
+            self.ways.answers_by_rules(view, &planner, memory)?
+        } else {
+            self.ways.answers(view, &planner, memory)?
+        };
         let mut out = vec![];
         for (mut row, (ranked, seconds)) in rows.into_iter().zip(&answers.ranked) {
             row.nearest = answers.nearest;
@@ -314,7 +326,14 @@ impl Scenes<'_> {
     }
 }
 
-fn classes(rows: &[Row], tries: usize) -> Vec<Class> {
+fn median_seconds(rows: &[Row], method: &str) -> f64 {
+    let mut seconds: Vec<f64> =
+        rows.iter().filter(|r| r.method == method && r.counts).map(|r| r.seconds).collect();
+    seconds.sort_by(f64::total_cmp);
+    seconds.get(seconds.len() / 2).copied().unwrap_or(0.0)
+}
+
+fn classes(rows: &[Row], tries: usize, methods: &[&str]) -> Vec<Class> {
     let mut names: Vec<&str> = vec![];
     for row in rows {
         if !names.contains(&row.class.as_str()) {
@@ -322,16 +341,15 @@ fn classes(rows: &[Row], tries: usize) -> Vec<Class> {
         }
     }
     let of = |name: &str, wanted: &dyn Fn(&Row) -> bool| {
-        let mut rates = [0.0; METHODS.len()];
-        let mut intervals = [(0.0, 0.0); METHODS.len()];
-        let mut trials = 0;
-        for (k, method) in METHODS.iter().enumerate() {
+        let (mut rates, mut intervals, mut trials) = (vec![], vec![], 0);
+        for method in methods {
             let mine: Vec<&Row> =
                 rows.iter().filter(|r| r.method == *method && r.counts && wanted(r)).collect();
             let held: usize = mine.iter().map(|r| r.held).sum();
             trials = mine.len();
-            rates[k] = held as f64 / (tries * trials).max(1) as f64;
-            intervals[k] = wilson_interval_of_fraction(rates[k], trials);
+            let rate = held as f64 / (tries * trials).max(1) as f64;
+            rates.push(rate);
+            intervals.push(wilson_interval_of_fraction(rate, trials));
         }
         Class { class: name.to_owned(), trials, rates, intervals }
     };
@@ -341,7 +359,7 @@ fn classes(rows: &[Row], tries: usize) -> Vec<Class> {
 }
 
 fn print_table(whole: &Whole) {
-    let heads: Vec<String> = METHODS.iter().map(|m| format!("{m:>20}")).collect();
+    let heads: Vec<String> = whole.methods.iter().map(|m| format!("{m:>20}")).collect();
     println!("{:>10} {:>7} {}", "", "scenes", heads.join(" "));
     for c in &whole.classes {
         let cells: Vec<String> = c

@@ -32,6 +32,17 @@ pub(crate) const METHODS: [&str; 11] = [
     "haf published",
 ];
 
+/// DGCM-Net in the published form, the same with one of its rules replaced by ours, and with all of them (`--published-rules`).
+pub(crate) const RULES: [&str; 7] = [
+    "network",
+    "all hypotheses",
+    "shapes too",
+    "free place",
+    "fit counts",
+    "best of a cluster",
+    "experience",
+];
+
 /// The data that the methods use.
 pub(super) struct Ways<'a> {
     /// The nominal gripper.
@@ -44,7 +55,7 @@ pub(super) struct Ways<'a> {
 /// The results of all methods on one view.
 pub(super) struct Answers {
     /// Each method's grasps, the best first, and the seconds that it took.
-    pub ranked: [(Vec<Ranked>, f64); METHODS.len()],
+    pub ranked: Vec<(Vec<Ranked>, f64)>,
     /// Distance of the nearest experience's feature.
     pub nearest: Option<f64>,
     /// Number of candidates from geometry and from experience.
@@ -83,7 +94,7 @@ impl Ways<'_> {
         let quality = |&grasp: &Grasp| ScoredGrasp { grasp, score: grasp.quality.total() };
         let scored: Vec<ScoredGrasp> = geometry.iter().map(quality).collect();
         let published = |planned: &[ScoredGrasp]| rank_as_published(planned, &alone.proposals, &clusters);
-        let ranked = [
+        let ranked = vec![
             (rank(&geometry, &[], &clusters), of_geometry),
             (rank(&[], &found.proposals, &clusters), of_experience),
             (rank_experience_as_published(&alone.proposals, &clusters), of_network),
@@ -98,6 +109,43 @@ impl Ways<'_> {
         ];
         let nearest = found.nearest.first().map(|m| m.distance);
         Ok(Answers { ranked, nearest, candidates: (geometry.len(), found.proposals.len()) })
+    }
+}
+
+impl Ways<'_> {
+    /// The results of the published form with other rules ([`RULES`]) on one view.
+    pub(super) fn answers_by_rules(
+        &self,
+        view: &GraspView,
+        options: &AntipodalOptions,
+        memory: &mut Memory,
+    ) -> Result<Answers> {
+        let (fitter, of_fitter) = timed(|| GraspFitter::new(view, self.gripper, options))?;
+        let (ours, published) = (ProposeOptions::default(), ProposeOptions::published());
+        let clusters = ClusterOptions::default();
+        let changed = [
+            published.clone(),
+            ProposeOptions { align: ours.align.clone(), ..published.clone() },
+            ProposeOptions { shapes: ours.shapes, ..published.clone() },
+            ProposeOptions { reach: ours.reach, ..published.clone() },
+            ProposeOptions { fit_scale: ours.fit_scale, ..published.clone() },
+            published,
+            ours,
+        ];
+        let (mut ranked, mut nearest, mut candidates) = (vec![], None, 0);
+        for (options, rule) in changed.iter().zip(RULES) {
+            let (found, seconds) = timed(|| propose(&fitter, self.network, memory, options))?;
+            nearest = found.nearest.first().map(|m| m.distance);
+            candidates = found.proposals.len();
+            let best = matches!(rule, "best of a cluster" | "experience");
+            let order = if best {
+                rank(&[], &found.proposals, &clusters)
+            } else {
+                rank_experience_as_published(&found.proposals, &clusters)
+            };
+            ranked.push((order, of_fitter + seconds));
+        }
+        Ok(Answers { ranked, nearest, candidates: (0, candidates) })
     }
 }
 

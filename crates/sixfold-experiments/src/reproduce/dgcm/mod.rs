@@ -265,6 +265,7 @@ pub(crate) fn run(a: &ReproduceDgcmArguments, json: &JsonArguments) -> Result<Ou
         trials: if a.quick { 1 } else { 15 },
         tries: TRIES,
         hard: true,
+        published_rules: false,
         physics: physics(),
         network: NetworkArguments { weights: a.network.weights.clone() },
         gpd: None,
