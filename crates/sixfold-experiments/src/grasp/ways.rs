@@ -125,7 +125,7 @@ impl Ways<'_> {
         let clusters = ClusterOptions::default();
         let changed = [
             published.clone(),
-            ProposeOptions { align: ours.align.clone(), ..published.clone() },
+            ProposeOptions { align: ours.align, ..published.clone() },
             ProposeOptions { shapes: ours.shapes, ..published.clone() },
             ProposeOptions { reach: ours.reach, ..published.clone() },
             ProposeOptions { fit_scale: ours.fit_scale, ..published.clone() },

@@ -34,6 +34,20 @@ fn experience_is_compared_with_geometry() {
         path.join("compare/part-0-both.png").exists() || path.join("compare/part-ply-0-both.png").exists()
     );
     assert_eq!(sixfold(path, compare).json()["classes"], table["classes"]);
+    // The published form with one of its rules at a time replaced by ours, ours among them as in the other table.
+    let rules = compare.replace("--out compare", "--published-rules --out rules");
+    let rules = sixfold(path, &rules).json();
+    let rate = |table: &serde_json::Value, method: &str| {
+        let place = table["methods"].as_array().unwrap().iter().position(|m| m == method).unwrap();
+        table["classes"][0]["rates"][place].clone()
+    };
+    assert_eq!(rules["methods"].as_array().unwrap().len(), 7);
+    assert_eq!(rules["classes"][0]["rates"].as_array().unwrap().len(), 7);
+    for method in ["network", "experience"] {
+        assert_eq!(rate(&rules, method), rate(&table, method), "{method}");
+    }
+    let mixed = compare.replace("--json", "--published-rules --json");
+    fails(path, &mixed, &["other options"]);
 }
 
 #[test]
