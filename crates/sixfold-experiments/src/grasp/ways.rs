@@ -32,8 +32,9 @@ pub(crate) const METHODS: [&str; 11] = [
     "haf published",
 ];
 
-/// DGCM-Net in the published form, the same with one of its rules replaced by ours, and with all of them (`--published-rules`).
-pub(crate) const RULES: [&str; 7] = [
+/// DGCM-Net in the published form, the same with one of its rules replaced by ours, with all of them, and with other distances of
+/// the gripper from the surface (`--published-rules`).
+pub(crate) const RULES: [&str; 11] = [
     "network",
     "all hypotheses",
     "shapes too",
@@ -41,6 +42,10 @@ pub(crate) const RULES: [&str; 7] = [
     "fit counts",
     "best of a cluster",
     "experience",
+    "1 cm over it",
+    "3 cm over it",
+    "4 cm over it",
+    "5 cm over it",
 ];
 
 /// The data that the methods use.
@@ -123,14 +128,19 @@ impl Ways<'_> {
         let (fitter, of_fitter) = timed(|| GraspFitter::new(view, self.gripper, options))?;
         let (ours, published) = (ProposeOptions::default(), ProposeOptions::published());
         let clusters = ClusterOptions::default();
+        let reaching = |reach| ProposeOptions { reach: Some(reach), ..published.clone() };
         let changed = [
             published.clone(),
             ProposeOptions { align: ours.align, ..published.clone() },
             ProposeOptions { shapes: ours.shapes, ..published.clone() },
             ProposeOptions { reach: ours.reach, ..published.clone() },
             ProposeOptions { fit_scale: ours.fit_scale, ..published.clone() },
-            published,
+            published.clone(),
             ours,
+            reaching(0.01),
+            reaching(0.03),
+            reaching(0.04),
+            reaching(0.05),
         ];
         let (mut ranked, mut nearest, mut candidates) = (vec![], None, 0);
         for (options, rule) in changed.iter().zip(RULES) {

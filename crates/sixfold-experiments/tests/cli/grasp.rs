@@ -41,8 +41,8 @@ fn experience_is_compared_with_geometry() {
         let place = table["methods"].as_array().unwrap().iter().position(|m| m == method).unwrap();
         table["classes"][0]["rates"][place].clone()
     };
-    assert_eq!(rules["methods"].as_array().unwrap().len(), 7);
-    assert_eq!(rules["classes"][0]["rates"].as_array().unwrap().len(), 7);
+    assert_eq!(rules["methods"].as_array().unwrap().len(), 11);
+    assert_eq!(rules["classes"][0]["rates"].as_array().unwrap().len(), 11);
     for method in ["network", "experience"] {
         assert_eq!(rate(&rules, method), rate(&table, method), "{method}");
     }
