@@ -43,7 +43,7 @@ pub(crate) const RULES: [&str; 11] = [
     "best of a cluster",
     "experience",
     "1 cm over it",
-    "3 cm over it",
+    "2 cm over it",
     "4 cm over it",
     "5 cm over it",
 ];
@@ -138,7 +138,7 @@ impl Ways<'_> {
             published.clone(),
             ours,
             reaching(0.01),
-            reaching(0.03),
+            reaching(0.02),
             reaching(0.04),
             reaching(0.05),
         ];
