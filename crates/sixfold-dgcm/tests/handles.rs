@@ -101,7 +101,7 @@ fn as_published_the_network_alone_transfers_to_a_fixed_distance() {
     for p in &found.proposals {
         assert_eq!((p.hypothesis, p.moved), (AlignmentHypothesis::Scaled, 0.0));
         let reach = fitter.reach(&p.grasp.camera_from_gripper, gripper.max_opening).unwrap();
-        assert!((reach + 0.02).abs() < 1e-6, "{reach}");
+        assert!((reach + 0.03).abs() < 1e-6, "{reach}");
         assert!((p.score - (-p.from.distance).exp()).abs() < 1e-12);
     }
     // The mug moved by a tenth of a radian, and the grasps with it: the same approach direction, on the same axis.
