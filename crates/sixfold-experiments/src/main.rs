@@ -24,6 +24,7 @@ use sixfold_shell::{PixelLimit, exit_code, progress};
 const IDLE: &[Idle] = &[
     Idle { command: "grasp measure", options: &["unit", "store"], when: &[When::Without("objects")] },
     Idle { command: "grasp compare", options: &["unit", "store"], when: &[When::Without("objects")] },
+    Idle { command: "grasp compare", options: &["gpd", "haf"], when: &[When::With("published_rules")] },
 ];
 
 /// Experiments of Sixfold: methods measured as their papers do, grasps tried in simulation.

@@ -256,13 +256,14 @@ impl ConvTranspose {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
     use burn::tensor::module::conv_transpose2d;
     use burn::tensor::ops::ConvTransposeOptions;
     use rand::SeedableRng;
 
-    fn tensor<const D: usize>(shape: [usize; D], seed: f32, device: &Device) -> Tensor<D> {
+    /// A tensor of this shape with reproducible numbers between -1 and 1.
+    pub(crate) fn tensor<const D: usize>(shape: [usize; D], seed: f32, device: &Device) -> Tensor<D> {
         let numbers: Vec<f32> =
             (0..shape.iter().product()).map(|i| ((i * i) as f32 * 0.013 + seed + i as f32).sin()).collect();
         Tensor::from_data(TensorData::new(numbers, shape), device)

@@ -1,8 +1,6 @@
 //! This crate's operations composed of Burn's own: for processors without our kernels, such as a GPU, and the reference of the
 //! kernels' tests. Results and gradients are the kernels' up to rounding.
 
-use std::sync::Arc;
-
 use burn::tensor::activation::{relu, sigmoid};
 use burn::tensor::module::{conv_transpose2d, conv2d};
 use burn::tensor::ops::{ConvOptions, ConvTransposeOptions};
@@ -103,7 +101,7 @@ pub fn gather(maps: Tensor<4>, places: &Places) -> Tensor<4> {
 }
 
 /// As [`crate::roi_align::roi_align`].
-pub fn roi_align(map: Tensor<4>, regions: &Arc<Regions>) -> Tensor<4> {
+pub fn roi_align(map: Tensor<4>, regions: &Regions) -> Tensor<4> {
     let [_, channels, height, width] = map.dims();
     let (boxes, side) = (regions.boxes.len(), regions.side);
     weighted_rows(pixels_as_rows(map), regions.terms([height, width]).into_iter())
@@ -147,14 +145,11 @@ pub(crate) fn batch_norm(
 
 #[cfg(test)]
 mod tests {
-    use super::*;
-    use crate::{batch_norm, kernels, ops, recurrent, roi_align};
+    use std::sync::Arc;
 
-    fn tensor<const D: usize>(shape: [usize; D], seed: f32, device: &Device) -> Tensor<D> {
-        let numbers: Vec<f32> =
-            (0..shape.iter().product()).map(|i| ((i * i) as f32 * 0.013 + seed + i as f32).sin()).collect();
-        Tensor::from_data(TensorData::new(numbers, shape), device)
-    }
+    use super::*;
+    use crate::conv_transpose::tests::tensor;
+    use crate::{batch_norm, kernels, ops, recurrent, roi_align};
 
     /// Output and gradient with respect to the input, of a function of an input of this shape.
     fn run(f: impl Fn(Tensor<4>) -> Tensor<4>, shape: [usize; 4]) -> [Vec<f32>; 2] {
@@ -217,9 +212,8 @@ mod tests {
         let boxes = vec![[2.0, 2.0, 20.0, 16.0], [8.0, 4.0, 90.0, 60.0], [-9.0, -30.0, 12.0, 5.0]];
         for samples in [Some(2), None] {
             let regions = Regions { boxes: boxes.clone(), scale: 0.25, side: 3, samples };
-            let shared = Arc::new(regions.clone());
             let kernel = |x| roi_align::roi_align(x, regions.clone());
-            equal(kernel, |x| roi_align(x, &shared), [1, 4, 12, 20]);
+            equal(kernel, |x| roi_align(x, &regions), [1, 4, 12, 20]);
         }
     }
 

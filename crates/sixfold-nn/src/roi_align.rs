@@ -112,11 +112,10 @@ pub fn roi_align(map: Tensor<4>, regions: Regions) -> Tensor<4> {
         regions.side,
         regions.samples
     );
-    let regions = Arc::new(regions);
     if !has_kernels(&map.device()) {
         return portable::roi_align(map, &regions);
     }
-    Tensor::from_dispatch(Dispatch::sixfold_roi_align(map.into_dispatch(), regions))
+    Tensor::from_dispatch(Dispatch::sixfold_roi_align(map.into_dispatch(), Arc::new(regions)))
 }
 
 #[cfg(test)]

@@ -105,7 +105,7 @@ struct Recorded<'a> {
     planners: [String; 2],
     experiences: usize,
     outcomes: usize,
-    methods: &'a [&'a str],
+    methods: Vec<&'a str>,
     gripper: &'a Gripper,
     mass: f64,
 }
@@ -123,7 +123,7 @@ pub(crate) struct Whole {
     pub classes: Vec<Class>,
     /// In the order of the methods.
     pub median_seconds: Vec<f64>,
-    methods: &'static [&'static str],
+    methods: Vec<&'static str>,
 }
 
 #[derive(Serialize)]
@@ -149,8 +149,8 @@ pub(crate) fn run(a: &CompareArguments) -> Result<Outcome> {
 }
 
 impl CompareArguments {
-    fn methods(&self) -> &'static [&'static str] {
-        if self.published_rules { &RULES } else { &METHODS }
+    fn methods(&self) -> Vec<&'static str> {
+        if self.published_rules { RULES.iter().map(|r| r.name).collect() } else { METHODS.to_vec() }
     }
 }
 
@@ -216,7 +216,7 @@ pub(crate) fn compare(a: &CompareArguments) -> Result<Whole> {
         outcomes: memory.outcomes(&gripper.name).attempts,
         friction: real.friction,
         mass: options.trial.mass,
-        classes: classes(&rows, a.tries, a.methods()),
+        classes: classes(&rows, a.tries, &a.methods()),
         median_seconds: a.methods().iter().map(|m| median_seconds(&rows, m)).collect(),
         methods: a.methods(),
     };
@@ -257,8 +257,8 @@ impl Scenes<'_> {
             seconds: scene.seconds,
             trial_seconds: 0.0,
         };
-        let methods = self.a.methods().iter();
-        let rows: Vec<Row> = methods.map(|&m| Row { method: m.to_owned(), ..empty.clone() }).collect();
+        let methods = self.a.methods().into_iter();
+        let rows: Vec<Row> = methods.map(|m| Row { method: m.to_owned(), ..empty.clone() }).collect();
         let (Some(view), Some(seen)) = (&scene.view, &scene.seen) else { return Ok(rows) };
         let planner = AntipodalOptions { seed: scene.noise, ..self.options.planner };
         let answers = if self.a.published_rules {

@@ -32,21 +32,41 @@ pub(crate) const METHODS: [&str; 11] = [
     "haf published",
 ];
 
-/// DGCM-Net in the published form, the same with one of its rules replaced by ours, with all of them, and with other distances of
-/// the gripper from the surface (`--published-rules`).
-pub(crate) const RULES: [&str; 11] = [
-    "network",
-    "all hypotheses",
-    "shapes too",
-    "free place",
-    "fit counts",
-    "best of a cluster",
-    "experience",
-    "1 cm over it",
-    "2 cm over it",
-    "4 cm over it",
-    "5 cm over it",
+/// DGCM-Net in the published form with a rule replaced.
+pub(crate) struct Rule {
+    pub name: &'static str,
+    options: fn() -> ProposeOptions,
+    /// Whether a cluster is represented by its best grasp, as ours, instead of its mean.
+    best: bool,
+}
+
+/// The published form, the same with one of its rules replaced by ours, with all of them, and with other distances of the gripper
+/// from the surface (`--published-rules`).
+pub(crate) const RULES: [Rule; 11] = [
+    replaced("network", published),
+    replaced("all hypotheses", || ProposeOptions { align: ours().align, ..published() }),
+    replaced("shapes too", || ProposeOptions { shapes: ours().shapes, ..published() }),
+    replaced("free place", || ProposeOptions { reach: ours().reach, ..published() }),
+    replaced("fit counts", || ProposeOptions { fit_scale: ours().fit_scale, ..published() }),
+    Rule { name: "best of a cluster", options: published, best: true },
+    Rule { name: "experience", options: ours, best: true },
+    replaced("1 cm over it", || ProposeOptions { reach: Some(0.01), ..published() }),
+    replaced("2 cm over it", || ProposeOptions { reach: Some(0.02), ..published() }),
+    replaced("4 cm over it", || ProposeOptions { reach: Some(0.04), ..published() }),
+    replaced("5 cm over it", || ProposeOptions { reach: Some(0.05), ..published() }),
 ];
+
+const fn replaced(name: &'static str, options: fn() -> ProposeOptions) -> Rule {
+    Rule { name, options, best: false }
+}
+
+fn ours() -> ProposeOptions {
+    ProposeOptions::default()
+}
+
+fn published() -> ProposeOptions {
+    ProposeOptions::published()
+}
 
 /// The data that the methods use.
 pub(super) struct Ways<'a> {
@@ -115,9 +135,7 @@ impl Ways<'_> {
         let nearest = found.nearest.first().map(|m| m.distance);
         Ok(Answers { ranked, nearest, candidates: (geometry.len(), found.proposals.len()) })
     }
-}
 
-impl Ways<'_> {
     /// The results of the published form with other rules ([`RULES`]) on one view.
     pub(super) fn answers_by_rules(
         &self,
@@ -126,29 +144,14 @@ impl Ways<'_> {
         memory: &mut Memory,
     ) -> Result<Answers> {
         let (fitter, of_fitter) = timed(|| GraspFitter::new(view, self.gripper, options))?;
-        let (ours, published) = (ProposeOptions::default(), ProposeOptions::published());
         let clusters = ClusterOptions::default();
-        let reaching = |reach| ProposeOptions { reach: Some(reach), ..published.clone() };
-        let changed = [
-            published.clone(),
-            ProposeOptions { align: ours.align, ..published.clone() },
-            ProposeOptions { shapes: ours.shapes, ..published.clone() },
-            ProposeOptions { reach: ours.reach, ..published.clone() },
-            ProposeOptions { fit_scale: ours.fit_scale, ..published.clone() },
-            published.clone(),
-            ours,
-            reaching(0.01),
-            reaching(0.02),
-            reaching(0.04),
-            reaching(0.05),
-        ];
         let (mut ranked, mut nearest, mut candidates) = (vec![], None, 0);
-        for (options, rule) in changed.iter().zip(RULES) {
-            let (found, seconds) = timed(|| propose(&fitter, self.network, memory, options))?;
+        for rule in &RULES {
+            let (found, seconds) = timed(|| propose(&fitter, self.network, memory, &(rule.options)()))?;
+            // The neighbours are the same for all rules; the most candidates of any are reported.
             nearest = found.nearest.first().map(|m| m.distance);
-            candidates = found.proposals.len();
-            let best = matches!(rule, "best of a cluster" | "experience");
-            let order = if best {
+            candidates = candidates.max(found.proposals.len());
+            let order = if rule.best {
                 rank(&[], &found.proposals, &clusters)
             } else {
                 rank_experience_as_published(&found.proposals, &clusters)

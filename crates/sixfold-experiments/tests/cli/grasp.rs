@@ -48,6 +48,7 @@ fn experience_is_compared_with_geometry() {
     }
     let mixed = compare.replace("--json", "--published-rules --json");
     fails(path, &mixed, &["other options"]);
+    fails(path, &format!("{mixed} --gpd gpd.safetensors"), &["--gpd", "--published-rules"]);
 }
 
 #[test]
