@@ -61,6 +61,7 @@ impl PyPoseEstimate {
 
 fn to_python(py: Python<'_>, estimate: PoseEstimate, camera: &Camera) -> PyResult<PyPoseEstimate> {
     let details = json_to_python(py, &estimate.details)?.cast_into::<PyDict>()?;
+    details.set_item("alternatives", json_to_python(py, &estimate.weighted_alternatives())?)?;
     if let Some(score) = &estimate.verification {
         details.set_item("verification", verification_to_python(py, score)?)?;
     }

@@ -162,9 +162,7 @@ impl Verifier {
         let camera = image.camera();
         let (mut x0, mut y0, mut x1, mut y1) =
             (f64::INFINITY, f64::INFINITY, f64::NEG_INFINITY, f64::NEG_INFINITY);
-        let (low, high) = mesh.bounding_box();
-        for k in 0..8 {
-            let corner = Vec3::from_fn(|i, _| if k >> i & 1 == 0 { low[i] } else { high[i] });
+        for corner in mesh.box_corners() {
             // An object that extends behind the camera is rendered into the whole image.
             let Some(p) = camera.project(&pose.transform_point(&corner)) else {
                 (x0, y0, x1, y1) = (0.0, 0.0, camera.width as f64, camera.height as f64);

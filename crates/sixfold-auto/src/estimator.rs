@@ -393,11 +393,7 @@ impl PoseEstimator for AutoEstimator {
 fn reported(hypothesis: &Hypothesis, others: &[&Hypothesis]) -> PoseEstimate {
     let evidence = &hypothesis.evidence;
     let estimate = &hypothesis.estimate;
-    let sum: f64 = hypothesis.probability + others.iter().map(|h| h.probability).sum::<f64>();
-    let alternatives: Vec<Value> = others
-        .iter()
-        .map(|h| json!({ "camera_from_object": rows(&h.estimate.camera_from_object), "weight": h.probability / sum }))
-        .collect();
+    let alternative = |h: &&Hypothesis| PoseEstimate::new(h.estimate.camera_from_object, h.probability);
     let numbers: Map<String, Value> = NAMES
         .iter()
         .zip(&hypothesis.numbers)
@@ -407,19 +403,14 @@ fn reported(hypothesis: &Hypothesis, others: &[&Hypothesis]) -> PoseEstimate {
         probability: Some(hypothesis.probability),
         verification: evidence.depth.map(|d| d.score),
         mask: Some(evidence.pixels.clone()),
+        alternatives: others.iter().map(alternative).collect(),
         details: Map::from_iter([
             ("method".to_owned(), hypothesis.method.into()),
             ("found_by".to_owned(), json!(hypothesis.found_by)),
-            ("alternatives".to_owned(), alternatives.into()),
             ("evidence".to_owned(), numbers.into()),
         ]),
         diagnostics: estimate.diagnostics.clone(),
         notes: estimate.notes.clone(),
         ..PoseEstimate::new(estimate.camera_from_object, hypothesis.probability)
     }
-}
-
-fn rows(pose: &Pose) -> [[f64; 4]; 4] {
-    let m = pose.to_matrix();
-    std::array::from_fn(|i| std::array::from_fn(|j| m[(i, j)]))
 }

@@ -16,6 +16,8 @@ use crate::numbers::{Numbers, Reported, add_others, of_evidence, strength};
 const SAME: f64 = 0.1;
 /// See [`SAME`].
 const SAME_BY_COLOR: f64 = 0.2;
+/// A pose is right if no point is farther from its true position, diameters.
+const RIGHT: f64 = 0.1;
 /// Poses that share more than this fraction of the smaller one's pixels are at the same place; chosen by hand, not swept.
 const ONE_PLACE: f64 = 0.5;
 
@@ -59,6 +61,11 @@ impl Pool<'_> {
         let (scene, shape, diameter) = (&self.scene, &self.shape, self.diameter);
         let (look_alikes, one_instance) = (self.look_alikes, self.one_instance);
         let options = VerificationOptions::default();
+        let with_alternatives = |mut estimate: PoseEstimate| {
+            let alternatives = std::mem::take(&mut estimate.alternatives);
+            std::iter::once(estimate).chain(alternatives)
+        };
+        let found: Vec<PoseEstimate> = found.into_iter().flat_map(with_alternatives).collect();
         let judged: Vec<Option<Hypothesis>> = found
             .into_par_iter()
             .map_init(EvidenceCollector::default, |collector, mut estimate| {
@@ -145,7 +152,29 @@ impl Pool<'_> {
             add_others(&mut h.numbers, agreement, here, self.one_instance.then_some(elsewhere));
             h.probability = self.calibration.probability(&h.numbers);
         }
+        self.exclude();
         self.hypotheses.sort_by(|a, b| b.probability.total_cmp(&a.probability));
+    }
+
+    /// Of poses at one place that are too far apart for two of them to be right, at most one is: with the odds `o` of each by itself, its probability
+    /// is `o / (1 + sum(o))`.
+    fn exclude(&mut self) {
+        let odds: Vec<f64> =
+            self.hypotheses.iter().map(|h| h.probability / (1.0 - h.probability).max(1e-12)).collect();
+        let exclusive = |a: &Hypothesis, b: &Hypothesis| {
+            let poses = [a, b].map(|h| &h.estimate.camera_from_object);
+            let apart = distance(poses[0], poses[1], self.symmetries, &self.shape);
+            one_place(a, b) && apart > 2.0 * RIGHT * self.diameter
+        };
+        let others = |i: usize| -> f64 {
+            let here = &self.hypotheses[i];
+            let rivals = self.hypotheses.iter().zip(&odds).enumerate().filter(|(k, _)| *k != i);
+            rivals.filter(|(_, (other, _))| exclusive(here, other)).map(|(_, (_, odds))| odds).sum()
+        };
+        let others: Vec<f64> = (0..odds.len()).map(others).collect();
+        for ((h, odds), others) in self.hypotheses.iter_mut().zip(odds).zip(others) {
+            h.probability = odds / (1.0 + odds + others);
+        }
     }
 
     /// The most probable hypotheses, one per place, at most `most`, each with the others at its place that are not much less
@@ -201,9 +230,7 @@ pub(crate) fn moved_to_depth(
 
 /// The largest distance between a corner of the object's box at both poses, minimised over the symmetries, metres.
 fn distance(a: &Pose, b: &Pose, symmetries: &[Pose], shape: &Shape<'_>) -> f64 {
-    let (low, high) = shape.mesh.bounding_box();
-    let corners: [Vec3; 8] =
-        std::array::from_fn(|k| Vec3::from_fn(|i, _| if k >> i & 1 == 0 { low[i] } else { high[i] }));
+    let corners = shape.mesh.box_corners();
     let at = |symmetry: &Pose| {
         let off = |c: &Vec3| (a.transform_point(&symmetry.transform_point(c)) - b.transform_point(c)).norm();
         corners.iter().map(off).fold(0.0, f64::max)

@@ -193,10 +193,28 @@ fn two_poses_that_look_alike_are_both_said() {
     let half = Pose::exp(&Vector6::new(0.0, 0.0, 0.0, 0.0, 0.0, std::f64::consts::PI));
     let rotated = Pose::new(truth().rotation() * half.rotation(), truth().translation());
     let poses = found(&[fixed_poses("a", &[truth(), rotated])], |_| (), &query, solid(1.0));
-    let alternatives = poses[0].details["alternatives"].as_array().unwrap();
+    let alternatives = poses[0].weighted_alternatives();
     assert_eq!(alternatives.len(), 1, "{alternatives:?}");
-    let weight = alternatives[0]["weight"].as_f64().unwrap();
-    assert!((weight - 0.5).abs() < 0.1, "{weight}");
+    assert!((alternatives[0].weight - 0.5).abs() < 0.1, "{alternatives:?}");
+    // Only one of both is right.
+    let sum = poses[0].confidence + poses[0].alternatives[0].confidence;
+    assert!(sum > 0.3 && sum < 1.0 && poses[0].confidence < 0.5, "{poses:?}");
+}
+
+#[test]
+fn poses_that_are_both_right_do_not_exclude_each_other() {
+    // A tenth of the diameter apart: either may be nearer to the truth. Far apart, at most one is right.
+    let (depth, _) = images(&wedge());
+    let camera = camera();
+    let query = Query { depth: Some(&depth), max_instances: 2, ..Query::new(&camera) };
+    let alone = found(&[fixed_poses("a", &[truth()])], |_| (), &query, wedge())[0].confidence;
+    let with =
+        |other: Pose| found(&[fixed_poses("a", &[truth(), other])], |_| (), &query, wedge())[0].confidence;
+    let half = Pose::exp(&Vector6::new(0.0, 0.0, 0.0, 0.0, 0.0, std::f64::consts::PI));
+    let rotated = Pose::new(truth().rotation() * half.rotation(), truth().translation());
+    let (near, far) = (with(beside(0.02)), with(rotated));
+    assert!(alone > 0.5 && far < alone, "{alone} {far}");
+    assert!((near - alone).abs() < 0.3, "{near} {alone}");
 }
 
 #[test]

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use sixfold_geometry::{Rect, Vec3};
+use sixfold_geometry::Rect;
 use sixfold_synth::augment::{AugmentError, Backgrounds, PhotographOptions};
 
 use crate::posed_image::PosedImage;
@@ -41,10 +41,7 @@ pub fn backgrounds_with_images(
     let mut frames: Vec<(&Arc<_>, Vec<Rect>)> = vec![];
     for posed in images {
         let Some(object) = objects.iter().find(|o| o.id == posed.object_id()) else { continue };
-        let (low, high) = object.mesh.bounding_box();
-        let corners = (0..8).filter_map(|i| {
-            let pick = |axis: usize| if i >> axis & 1 == 0 { low[axis] } else { high[axis] };
-            let corner = Vec3::new(pick(0), pick(1), pick(2));
+        let corners = object.mesh.box_corners().into_iter().filter_map(|corner| {
             posed.camera().project(&posed.camera_from_object().transform_point(&corner))
         });
         let (x, y): (Vec<f64>, Vec<f64>) = corners.map(|c| (c.x, c.y)).unzip();

@@ -1,5 +1,6 @@
 //! An estimated pose with its evidence.
 
+use serde::Serialize;
 use serde_json::{Map, Value};
 use sixfold_align::VerificationScore;
 use sixfold_geometry::{Pose, RgbImage};
@@ -11,6 +12,15 @@ pub struct Diagnostic {
     pub name: &'static str,
     /// The image.
     pub image: RgbImage,
+}
+
+/// Another pose of an instance, as programs print it.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct AlternativePose {
+    /// The pose by rows, metres.
+    pub camera_from_object: [[f64; 4]; 4],
+    /// Its share of the confidence of all poses of the instance, 0 to 1.
+    pub weight: f64,
 }
 
 /// An estimated pose with its evidence.
@@ -27,6 +37,8 @@ pub struct PoseEstimate {
     pub verification: Option<VerificationScore>,
     /// The object's visible pixels as indices `y * width + x`, if the method segments.
     pub mask: Option<Vec<u32>>,
+    /// Other poses of the same instance with which the image agrees about equally: the object has at most one of them.
+    pub alternatives: Vec<PoseEstimate>,
     /// Additional data of the method under its own keys; part of the JSON that programs print.
     pub details: Map<String, Value>,
     /// Images for people, if the query asks for them.
@@ -44,10 +56,21 @@ impl PoseEstimate {
             probability: None,
             verification: None,
             mask: None,
+            alternatives: vec![],
             details: Map::new(),
             diagnostics: vec![],
             notes: vec![],
         }
+    }
+
+    /// The alternatives as programs print them, each with its confidence relative to the sum over all poses of the instance.
+    pub fn weighted_alternatives(&self) -> Vec<AlternativePose> {
+        let sum = self.confidence + self.alternatives.iter().map(|other| other.confidence).sum::<f64>();
+        let weighted = |other: &PoseEstimate| AlternativePose {
+            camera_from_object: other.camera_from_object.rows(),
+            weight: if sum > 0.0 { other.confidence / sum } else { 0.0 },
+        };
+        self.alternatives.iter().map(weighted).collect()
     }
 
     /// The visible fraction of the object, if verification has computed it.

@@ -21,7 +21,7 @@ mod store;
 pub use cache::{Cache, CacheError};
 pub use detector::{DetectedObject, ObjectDetector};
 pub use error::EstimatorError;
-pub use estimate::{Diagnostic, PoseEstimate};
+pub use estimate::{AlternativePose, Diagnostic, PoseEstimate};
 pub use method::{MinConfidence, Need, Needs, PoseEstimator, PreparedObject, downcast};
 pub use object::Object;
 pub use query::{Memo, Query, check_min_confidence};

@@ -178,10 +178,6 @@ impl ObjectRecord {
     /// The record of a mesh file.
     pub fn of_mesh(source: &Path, unit: Unit, mesh: &Mesh, info: &ModelInfo) -> ObjectRecord {
         let array = |v: &sixfold_geometry::Vec3| [v.x, v.y, v.z];
-        let rows = |pose: &Pose| {
-            let m = pose.to_matrix();
-            std::array::from_fn(|i| std::array::from_fn(|j| m[(i, j)]))
-        };
         let free = |s: &ContinuousSymmetry| FreeAxis { axis: array(&s.axis), offset: array(&s.offset) };
         ObjectRecord {
             version: VERSION,
@@ -191,7 +187,7 @@ impl ObjectRecord {
             vertices: mesh.vertices().len(),
             faces: mesh.faces().len(),
             without_mesh: false,
-            symmetries_discrete: info.symmetries_discrete.iter().map(rows).collect(),
+            symmetries_discrete: info.symmetries_discrete.iter().map(Pose::rows).collect(),
             symmetries_continuous: info.symmetries_continuous.iter().map(free).collect(),
         }
     }

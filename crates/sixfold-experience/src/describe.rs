@@ -39,7 +39,6 @@ impl Description {
     pub fn new(stored: &Stored, with_feature: bool) -> Description {
         let e = &stored.experience;
         let c = &e.crop.camera;
-        let m = e.camera_from_gripper.to_matrix();
         Description {
             summary: Summary {
                 id: stored.id,
@@ -51,7 +50,7 @@ impl Description {
                 network: e.network.clone(),
                 provenance: e.provenance.clone(),
             },
-            camera_from_gripper: std::array::from_fn(|i| std::array::from_fn(|j| m[(i, j)])),
+            camera_from_gripper: e.camera_from_gripper.rows(),
             opening: e.opening,
             camera: [c.fx, c.fy, c.cx, c.cy],
             side: e.crop.side,

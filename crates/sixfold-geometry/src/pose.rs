@@ -125,6 +125,12 @@ impl Pose {
         self.0.to_homogeneous()
     }
 
+    /// The 4x4 matrix by rows.
+    pub fn rows(&self) -> [[f64; 4]; 4] {
+        let m = self.to_matrix();
+        std::array::from_fn(|i| std::array::from_fn(|j| m[(i, j)]))
+    }
+
     /// The rotation as a quaternion.
     pub fn rotation(&self) -> UnitQuaternion<f64> {
         self.0.rotation

@@ -13,6 +13,12 @@ impl Mesh {
         self.vertices().iter().fold((first, first), |(low, high), v| (low.inf(v), high.sup(v)))
     }
 
+    /// The eight corners of this box; bit `k` of the index is set where coordinate `k` is the maximum.
+    pub fn box_corners(&self) -> [Vec3; 8] {
+        let (low, high) = self.bounding_box();
+        std::array::from_fn(|i| Vec3::from_fn(|k, _| if i >> k & 1 == 1 { high[k] } else { low[k] }))
+    }
+
     /// The vertices that are outermost in one of `directions` directions spread over the sphere, in metres. They suffice
     /// to compute the object's box in an image.
     pub fn extremes(&self, directions: usize) -> Vec<Vec3> {
@@ -131,6 +137,8 @@ mod tests {
             assert!((cube.surface_area() - 24.0).abs() < 1e-12);
             assert!((cube.diameter() - 12f64.sqrt()).abs() < 1e-12);
             assert_eq!(cube.bounding_box(), (Vec3::repeat(-1.0), Vec3::repeat(1.0)));
+            let [first, second, .., last] = cube.box_corners();
+            assert_eq!([first, second, last], [[-1.0; 3], [1.0, -1.0, -1.0], [1.0; 3]].map(Vec3::from));
             // Angle weighting gives the diagonal for any triangulation of the sides.
             for (v, n) in cube.vertices().iter().zip(cube.vertex_normals()) {
                 assert!((n - v.normalize()).norm() < 1e-12, "{v} {n}");

@@ -106,11 +106,6 @@ pub struct PoseFile {
     pub photographs: Vec<PoseRecord>,
 }
 
-fn rows(pose: &Pose) -> Rows {
-    let m = pose.to_matrix();
-    std::array::from_fn(|i| std::array::from_fn(|j| m[(i, j)]))
-}
-
 /// The images of all objects, in one list with the number of their object.
 fn all(images: &RoughImages) -> Vec<(usize, &RoughImage)> {
     let numbered = images.objects.iter().enumerate();
@@ -125,9 +120,9 @@ impl PoseFile {
             name: image.posed.name().to_owned(),
             image: image.number,
             frame: image.posed.frame().map(|frame| (frame.scene_id, frame.im_id)),
-            given: rows(image.posed.camera_from_object()),
-            undisturbed: disturbed.then(|| rows(&image.given)),
-            camera_from_object: rows(image.posed.camera_from_object()),
+            given: image.posed.camera_from_object().rows(),
+            undisturbed: disturbed.then(|| image.given.rows()),
+            camera_from_object: image.posed.camera_from_object().rows(),
             moved_mm: 0.0,
             rotated_degrees: 0.0,
             difference: [None, None],
@@ -198,7 +193,7 @@ impl PoseFile {
                 for ((image, (pose, _)), record) in of.iter().zip(&found).zip(&mut records) {
                     let given = image.camera_from_object();
                     let moved = pose.transform_point(&centre) - given.transform_point(&centre);
-                    record.camera_from_object = rows(pose);
+                    record.camera_from_object = pose.rows();
                     record.moved_mm = 1e3 * moved.norm();
                     record.rotated_degrees = pose.rotation_angle_to(given).to_degrees();
                 }
@@ -235,7 +230,7 @@ impl PoseFile {
         self.places = refined.places;
         self.disagreement = refined.disagreement;
         for (record, report) in self.photographs.iter_mut().zip(&refined.sources) {
-            record.camera_from_object = rows(&report.camera_from_object);
+            record.camera_from_object = report.camera_from_object.rows();
             record.moved_mm = report.moved * 1e3;
             record.rotated_degrees = report.rotated.to_degrees();
             record.difference = report.difference.map(|d| d.is_finite().then_some(d));

@@ -282,14 +282,10 @@ pub(crate) fn depth_for_icp() -> DepthOptions {
 /// Details of an estimate: whether the outline was aligned, ICP, the square of the image in the last pass (x, y, side), and all
 /// hypotheses from PnP, best first.
 fn details(id: u32, posed: &Pix2PosePose, icp: Value) -> Map<String, Value> {
-    let rows = |pose: &Pose| -> [[f64; 4]; 4] {
-        let m = pose.to_matrix();
-        std::array::from_fn(|i| std::array::from_fn(|j| m[(i, j)]))
-    };
     let window = &posed.found.view.window;
     let hypothesis = |h: &crate::estimate::ThresholdHypothesis| {
         json!({
-            "camera_from_object": rows(&h.camera_from_object),
+            "camera_from_object": h.camera_from_object.rows(),
             "confidence": h.score,
             "inliers": h.inliers,
             // Rounded to a decimal: 0.15, not the single-precision number closest to it.

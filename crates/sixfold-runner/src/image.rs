@@ -7,7 +7,9 @@ use std::time::Instant;
 use serde::Serialize;
 use serde_json::{Map, Value};
 use sixfold_align::{PreparedDepth, VerificationScore};
-use sixfold_estimator::{EstimatorError, Object, PoseEstimate, PoseEstimator, PreparedObject, Query};
+use sixfold_estimator::{
+    AlternativePose, EstimatorError, Object, PoseEstimate, PoseEstimator, PreparedObject, Query,
+};
 
 use crate::overruled::left_standing;
 
@@ -93,6 +95,8 @@ pub struct FoundPose {
     /// Score of verification by rendering.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub verification: Option<VerificationScore>,
+    /// Other poses of the same instance that are about as good; the object has at most one of them.
+    pub alternatives: Vec<AlternativePose>,
     /// The method's own keys, and `seconds`.
     #[serde(flatten)]
     pub details: Map<String, Value>,
@@ -103,15 +107,15 @@ pub struct FoundPose {
 
 impl FoundPose {
     fn new(found: &FoundObject, estimate: &PoseEstimate) -> FoundPose {
-        let m = estimate.camera_from_object.to_matrix();
         let mut details = estimate.details.clone();
         if !details.contains_key("seconds") {
             details.insert("seconds".to_owned(), found.seconds.into());
         }
         FoundPose {
             object: found.object.name().to_owned(),
-            camera_from_object: std::array::from_fn(|i| std::array::from_fn(|j| m[(i, j)])),
+            camera_from_object: estimate.camera_from_object.rows(),
             confidence: estimate.confidence,
+            alternatives: estimate.weighted_alternatives(),
             probability: estimate.probability,
             verification: estimate.verification,
             details,

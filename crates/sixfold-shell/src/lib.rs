@@ -8,6 +8,7 @@
 pub mod screen;
 
 pub mod board;
+pub mod companion;
 pub mod datasets;
 pub mod demo;
 pub mod depth_views;

@@ -5,7 +5,6 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result};
 use clap::Args;
 use serde::Serialize;
-use sixfold_geometry::Pose;
 
 /// `--json`: to the screen, or to a file.
 #[derive(Debug, Default, Args, Clone)]
@@ -25,12 +24,6 @@ impl JsonArguments {
     pub fn file(&self) -> Option<&PathBuf> {
         self.json.as_ref().and_then(Option::as_ref)
     }
-}
-
-/// A pose as four rows of four numbers, translation in metres.
-pub fn pose_rows(pose: &Pose) -> [[f64; 4]; 4] {
-    let m = pose.to_matrix();
-    std::array::from_fn(|i| std::array::from_fn(|j| m[(i, j)]))
 }
 
 /// Prints JSON or calls `table`, and writes the JSON file if one was requested.

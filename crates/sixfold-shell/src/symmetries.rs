@@ -8,8 +8,6 @@ use sixfold_mesh::{FoundSymmetry, Mesh};
 use sixfold_plot::{Canvas, INK};
 use sixfold_render::portrait;
 
-use crate::output::pose_rows;
-
 /// Height of the line of text over each image, pixels.
 const CAPTION: usize = 26;
 /// Image pixels per font pixel.
@@ -49,7 +47,7 @@ impl ListedSymmetry {
             color_difference_p95: s.color.map(|c| c.p95),
             by_shape: s.by_shape.name(),
             by_shape_and_color: s.by_shape_and_color.name(),
-            poses: s.poses().iter().map(pose_rows).collect(),
+            poses: s.poses().iter().map(Pose::rows).collect(),
         }
     }
 }

@@ -8,7 +8,7 @@ use sixfold_nn::keypoints::KeypointFinder;
 use crate::error::TeachError;
 use crate::one_side::camera_above_table;
 use crate::shape::step;
-use crate::teaching::{By, Step, Teaching, World, is_same, rows};
+use crate::teaching::{By, Step, Teaching, World, is_same};
 use crate::unboarded::{KnownLength, PutTogether, SeenFeatures, features_of, put_together};
 
 impl Teaching {
@@ -103,7 +103,7 @@ impl Teaching {
     fn keep_poses(&mut self, used: &[usize], found: PutTogether) -> Result<(), TeachError> {
         for (number, pose) in used.iter().zip(found.camera_from_world) {
             let (pose, reason) = match pose {
-                Ok(pose) => (Some(rows(&pose)), None),
+                Ok(pose) => (Some(pose.rows()), None),
                 Err(reason) => (None, Some(reason)),
             };
             // This also replaces poses that a person had corrected: they were in another frame.

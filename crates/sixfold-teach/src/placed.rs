@@ -119,7 +119,7 @@ fn aligned(given: &Mesh, hull: &Mesh) -> Vec<Pose> {
         .collect();
     sort(&mut all);
     let mut distinct: Vec<Pose> = vec![];
-    let corners = corners(given);
+    let corners = given.box_corners();
     for (_, pose) in all {
         let is_new = |other: &Pose| {
             let off = |c: &Vec3| (pose.transform_point(c) - other.transform_point(c)).norm();
@@ -156,11 +156,6 @@ fn rotations() -> Vec<UnitQuaternion<f64>> {
 fn centre_of(mesh: &Mesh) -> Vec3 {
     let (low, high) = mesh.bounding_box();
     0.5 * (low + high)
-}
-
-fn corners(mesh: &Mesh) -> [Vec3; 8] {
-    let (low, high) = mesh.bounding_box();
-    std::array::from_fn(|k| Vec3::from_fn(|i, _| if k >> i & 1 == 0 { low[i] } else { high[i] }))
 }
 
 /// Comparison of outlines with masks.

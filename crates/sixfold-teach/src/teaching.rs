@@ -159,11 +159,6 @@ pub(crate) fn is_same<T: Serialize + DeserializeOwned + PartialEq>(a: &T, b: &T)
         || as_kept(b).is_some_and(|b| *a == b)
 }
 
-pub(crate) fn rows(pose: &Pose) -> [[f64; 4]; 4] {
-    let m = pose.to_matrix();
-    std::array::from_fn(|i| std::array::from_fn(|j| m[(i, j)]))
-}
-
 impl Teaching {
     /// Opens or creates the folder. If the options differ from those with which it was created, all steps are repeated.
     ///
@@ -380,7 +375,7 @@ impl Teaching {
                 continue;
             }
             let (pose, reason) = match pose {
-                Ok(pose) => (Some(rows(&pose)), None),
+                Ok(pose) => (Some(pose.rows()), None),
                 Err(reason) => (None, Some(reason)),
             };
             photograph.pose_by = pose.map(|_| By::Program);
@@ -499,7 +494,7 @@ impl Teaching {
         write_ply(&path, &shape.mesh, Unit::Metre, PlyFormat::BinaryLittleEndian)
             .map_err(|e| TeachError::File { path, what: e.to_string() })?;
         self.known.state.shape = Some(ShapeFacts {
-            board_from_object: rows(&shape.world_from_object),
+            board_from_object: shape.world_from_object.rows(),
             unseen: shape.unseen,
             with_depth: shape.with_depth,
             one_side: shape.one_side,
@@ -559,7 +554,7 @@ impl Teaching {
             return Err(TeachError::File { path: PathBuf::from(&photograph.name), what });
         }
         let photograph = &mut self.known.state.photographs[number];
-        let given = Some(rows(camera_from_board));
+        let given = Some(camera_from_board.rows());
         if photograph.pose_by == Some(By::Person) && is_same(&photograph.camera_from_board, &given) {
             return Ok(());
         }

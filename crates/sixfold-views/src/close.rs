@@ -10,6 +10,7 @@ use sixfold_synth::augment::Coverage;
 
 use crate::crop::Crop;
 use crate::direct::Direct;
+use crate::distinction::distinction;
 use crate::error::ViewsError;
 use crate::estimate::{Correspondences, Hypothesis, Part, Views};
 use crate::printed::PrintMatches;
@@ -28,9 +29,11 @@ const MAX_GROWTH: f64 = 4.0;
 const TOLERANCE: f64 = 0.02;
 /// A pose rotated by 180 degrees is refined if the image agrees with it at least this much, relative to the pose itself.
 const ROTATED: f64 = 0.3;
-/// It comes before the pose if they agree with the image about equally, and it agrees better in what is drawn on the object.
+/// It comes before the pose if they agree with the image about equally, and the image is like it and not like the pose where they differ.
 const ROTATED_TOLERANCE: f64 = 0.15;
-const ROTATED_DRAWN: f64 = 0.03;
+const DISTINCT: f64 = 0.05;
+/// The other of both is reported too if the image agrees with it at most by this much less: prints on scanned meshes are not exact.
+const AS_GOOD: f64 = 0.05;
 /// As [`TOLERANCE`], for a pose aligned directly; poses that are off by less than a pixel differ by up to this much.
 const DIRECT_TOLERANCE: f64 = 0.05;
 /// Smallest mean correlation of what is drawn on the object with the image, after alignment, at which the alignment is kept; chosen on
@@ -43,6 +46,14 @@ const CHANCE: usize = 6;
 /// Each further `PRINT` keypoints that agree divide the disagreement with the image by e.
 const PRINT: f64 = 20.0;
 
+/// A pose with its rival.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Settled {
+    pub(crate) pose: Hypothesis,
+    /// The pose rotated by 180 degrees, with which the image agrees hardly less.
+    pub(crate) rival: Option<Hypothesis>,
+}
+
 impl Views<'_> {
     /// Poses with the boxes in which they were found, each refined once more ([`Views::closer`]), best first.
     pub(crate) fn closer_all(
@@ -52,24 +63,9 @@ impl Views<'_> {
         image: &RgbImage,
         camera: &Camera,
     ) -> Result<Vec<Hypothesis>, ViewsError> {
-        let all = |poses: Vec<(Hypothesis, Rect)>| -> Result<Vec<Hypothesis>, ViewsError> {
-            poses.into_par_iter().map(|(h, bbox)| self.closer(h, image, camera, &bbox)).collect()
-        };
-        let mut closer = all(poses)?;
-        let best = closer.iter().copied().reduce(|a, b| if b.similarity > a.similarity { b } else { a });
-        if let Some(best) = best.filter(|best| best.similarity > 0.0) {
-            let mut rotated = all(self.rotated(&best, image, camera)?)?;
-            decide(&best, &mut rotated);
-            rotated.append(&mut closer);
-            closer = rotated;
-        }
-        if let Some(prints) = prints {
-            for hypothesis in &mut closer {
-                let agreeing = prints.agreeing(&hypothesis.camera_from_object);
-                let doubt = (-(agreeing.saturating_sub(CHANCE) as f64) / PRINT).exp();
-                hypothesis.similarity = 1.0 - (1.0 - hypothesis.similarity) * doubt;
-            }
-        }
+        let closer = |(pose, bbox): (Hypothesis, Rect)| self.closer(pose, image, camera, &bbox);
+        let mut closer: Vec<Hypothesis> = poses.into_par_iter().map(closer).collect::<Result<_, _>>()?;
+        closer.iter_mut().for_each(|hypothesis| add_prints(hypothesis, prints));
         closer.sort_by(|a, b| b.similarity.total_cmp(&a.similarity));
         Ok(closer)
     }
@@ -106,6 +102,37 @@ impl Views<'_> {
             }
         }
         Ok(out)
+    }
+
+    /// A pose, or that rotated by 180 degrees about an axis of the object's bounding box if both agree with the image about equally and the image
+    /// is more like the latter where the object looks different at both ([`distinction`]). With the other of both, if the image agrees with it hardly
+    /// less.
+    pub(crate) fn settled(
+        &self,
+        pose: Hypothesis,
+        prints: Option<&PrintMatches>,
+        image: &RgbImage,
+        camera: &Camera,
+    ) -> Result<Settled, ViewsError> {
+        let rival = |(rotated, bbox): (Hypothesis, Rect)| -> Result<(f64, Hypothesis), ViewsError> {
+            let mut rotated = self.closer(rotated, image, camera, &bbox)?;
+            add_prints(&mut rotated, prints);
+            let poses = [&pose.camera_from_object, &rotated.camera_from_object];
+            let close = (pose.similarity - rotated.similarity).abs() < ROTATED_TOLERANCE;
+            let towards = if close { distinction(self.mesh, image, camera, poses) } else { 1.0 };
+            Ok((towards, rotated))
+        };
+        let rivals = self.rotated(&pose, image, camera)?.into_par_iter().map(rival);
+        let rivals: Vec<(f64, Hypothesis)> = rivals.collect::<Result<_, _>>()?;
+        let nearest = rivals.into_iter().min_by(|a, b| a.0.total_cmp(&b.0));
+        let Some((towards, rotated)) = nearest else { return Ok(Settled { pose, rival: None }) };
+        let similarity = pose.similarity.max(rotated.similarity);
+        let equal = |rival: Hypothesis| (similarity - rival.similarity < AS_GOOD).then_some(rival);
+        Ok(if towards < -DISTINCT {
+            Settled { pose: Hypothesis { similarity, ..rotated }, rival: equal(pose) }
+        } else {
+            Settled { pose, rival: equal(rotated) }
+        })
     }
 
     /// A pose refined in a crop of higher resolution around the whole object at this pose, with its outline aligned there.
@@ -216,15 +243,12 @@ impl Views<'_> {
     }
 }
 
-/// A pose rotated by 180 degrees comes before the pose itself if both agree with the image about equally and it agrees better in what is drawn
-/// on the object: what is drawn on the sides is little of the object, but it decides.
-fn decide(best: &Hypothesis, rotated: &mut [Hypothesis]) {
-    for pose in rotated {
-        let close = (best.similarity - pose.similarity).abs() < ROTATED_TOLERANCE;
-        if close && pose.drawn > best.drawn + ROTATED_DRAWN {
-            pose.similarity = pose.similarity.max(best.similarity);
-        }
-    }
+/// Keypoints that agree with a pose raise its similarity.
+fn add_prints(pose: &mut Hypothesis, prints: Option<&PrintMatches>) {
+    let Some(prints) = prints else { return };
+    let agreeing = prints.agreeing(&pose.camera_from_object);
+    let doubt = (-(agreeing.saturating_sub(CHANCE) as f64) / PRINT).exp();
+    pose.similarity = 1.0 - (1.0 - pose.similarity) * doubt;
 }
 
 #[cfg(test)]
@@ -262,28 +286,44 @@ mod tests {
         let bbox = projected_box(&mesh, &camera, &rotated).unwrap();
         let start = Hypothesis { camera_from_object: rotated, similarity: 0.0, inliers: 0, drawn: 0.0 };
         let found = views.closer_all(vec![(start, bbox)], None, &image, &camera).unwrap();
-        let best = found[0].camera_from_object;
+        assert!(found[0].camera_from_object.rotation_angle_to(&rotated) < 0.1, "first what it started from");
+        let settled = views.settled(found[0], None, &image, &camera).unwrap();
+        assert!(settled.pose.similarity >= found[0].similarity);
+        let best = settled.pose.camera_from_object;
         assert!(best.rotation_angle_to(&truth) < 0.01, "{}", best.rotation_angle_to(&truth));
         // Precise, as what is drawn on the box is aligned.
         assert!(best.distance_to(&truth) < 0.001, "{}", best.distance_to(&truth));
     }
 
     #[test]
-    fn what_is_drawn_decides_between_rotated_poses_only_if_they_agree_about_equally() {
-        let of = |similarity: f64, drawn: f64| Hypothesis {
-            camera_from_object: Pose::identity(),
-            similarity,
-            inliers: 0,
-            drawn,
-        };
-        let after = |pose: Hypothesis| {
-            let mut rotated = [pose];
-            decide(&of(0.6, 0.3), &mut rotated);
-            rotated[0].similarity
-        };
-        assert_eq!(after(of(0.5, 0.4)), 0.6);
-        assert_eq!(after(of(0.5, 0.31)), 0.5);
-        assert_eq!(after(of(0.4, 0.4)), 0.4);
-        assert_eq!(after(of(0.7, 0.4)), 0.7);
+    fn of_two_faces_that_look_the_same_both_poses_are_reported() {
+        // The box has the same print after half a turn about x, also on its sides.
+        let mesh = printed_box_with(|_, side| side < 0.0);
+        let extractor = Extractor::shipped().unwrap();
+        let device = burn::tensor::Device::default();
+        let refiner = Refiner::new(RefinerNetwork::shipped(&device).unwrap(), device);
+        let options = ViewsOptions::default();
+        let plain = crate::estimate::tests::without_refiner(&extractor, &mesh, &[], &options);
+        let views = Views { refiner: Some(&refiner), ..plain };
+        let camera = Camera::new(900.0, 900.0, 319.5, 239.5, 640, 480).unwrap();
+        let truth =
+            Pose::exp(&[0.0, 0.0, 0.0, 0.35, 0.0, 0.0].into()).with_translation(Vec3::new(0.02, 0.01, 0.5));
+        let image = photograph(&mesh, &truth, &camera);
+        let bbox = projected_box(&mesh, &camera, &truth).unwrap();
+        let start = Hypothesis { camera_from_object: truth, similarity: 0.0, inliers: 0, drawn: 0.0 };
+        let found = views.closer(start, &image, &camera, &bbox).unwrap();
+        let settled = views.settled(found, None, &image, &camera).unwrap();
+        let rival = settled.rival.expect("the other face").camera_from_object;
+        let angle = rival.rotation_angle_to(&settled.pose.camera_from_object);
+        assert!((angle - std::f64::consts::PI).abs() < 0.05, "{angle}");
+        // With a print of its own on every face there is no other pose.
+        let mesh = crate::printed::tests::printed_box();
+        let views = Views { mesh: &mesh, outline: &mesh, ..views };
+        let image = photograph(&mesh, &truth, &camera);
+        let found = views.closer(start, &image, &camera, &bbox).unwrap();
+        assert_eq!(
+            views.settled(found, None, &image, &camera).unwrap(),
+            Settled { pose: found, rival: None }
+        );
     }
 }

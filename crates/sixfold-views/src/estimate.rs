@@ -190,7 +190,7 @@ impl Views<'_> {
         camera: &Camera,
         bbox: &Rect,
         keypoints: Option<&ImageKeypoints>,
-    ) -> Result<Option<Vec<Hypothesis>>, ViewsError> {
+    ) -> Result<Option<(Vec<Hypothesis>, Option<Hypothesis>)>, ViewsError> {
         let Some(part) = Part::new(self.extractor, image, camera, bbox, self.options.side)? else {
             return Ok(None);
         };
@@ -202,9 +202,14 @@ impl Views<'_> {
         let mut chosen: Vec<(Hypothesis, Rect)> = hypotheses[..close].iter().map(|h| (*h, *bbox)).collect();
         chosen.extend(self.by_print(prints.as_ref(), camera, 1));
         let closer = self.closer_all(chosen, prints.as_ref(), image, camera)?;
-        let closer = self.chosen(closer, bbox, image, camera)?;
+        let mut closer = self.chosen(closer, bbox, image, camera)?;
+        let mut rival = None;
+        if let Some(best) = closer.first_mut() {
+            let settled = self.settled(*best, prints.as_ref(), image, camera)?;
+            (*best, rival) = (settled.pose, settled.rival);
+        }
         hypotheses.splice(..close, closer);
-        Ok(Some(hypotheses))
+        Ok(Some((hypotheses, rival)))
     }
 
     /// The matches of what is printed on the object with an image's keypoints.
@@ -555,7 +560,7 @@ pub(crate) mod tests {
         let find = |outline: bool, bbox: &Rect| {
             let options = ViewsOptions { outline, ..ViewsOptions::default() };
             let views = without_refiner(&extractor, &mesh, &templates, &options);
-            views.find(&image, &camera, bbox, None).unwrap().unwrap()
+            views.find(&image, &camera, bbox, None).unwrap().unwrap().0
         };
         for outline in [false, true] {
             let found = find(outline, &bbox);

@@ -224,7 +224,7 @@ impl PoseEstimator for ViewsEstimator {
         let keypoints = (!object.printed.views.is_empty())
             .then(|| query.image_memo.get_or_default::<KeptKeypoints>().of_image(image));
         let keypoints = keypoints.as_deref();
-        let estimate = |pose: &Hypothesis, score: f64, details: &[(&str, f64)]| {
+        let one = |pose: &Hypothesis, score: f64, details: &[(&str, f64)]| {
             let confidence = pose.similarity.clamp(0.0, 1.0) * score;
             let mut estimate = PoseEstimate::new(pose.camera_from_object, confidence);
             let details = details.iter().map(|(name, value)| ((*name).to_owned(), json!(value)));
@@ -232,8 +232,14 @@ impl PoseEstimator for ViewsEstimator {
                 ("similarity".to_owned(), json!(pose.similarity)),
                 ("inliers".to_owned(), json!(pose.inliers)),
             ]));
-            (confidence >= query.min_confidence).then_some(estimate)
+            estimate
         };
+        let estimate =
+            |pose: &Hypothesis, rival: Option<&Hypothesis>, score: f64, details: &[(&str, f64)]| {
+                let mut estimate = one(pose, score, details);
+                estimate.alternatives.extend(rival.map(|rival| one(rival, score, details)));
+                (estimate.confidence >= query.min_confidence).then_some(estimate)
+            };
         let Some(region) = query.region else {
             let proposals = self.proposals.as_deref().ok_or(EstimatorError::Input {
                 what: "region that contains the object",
@@ -249,20 +255,25 @@ impl PoseEstimator for ViewsEstimator {
                 .map_err(EstimatorError::method)?
                 .iter()
                 .filter_map(|f| {
-                    estimate(&f.pose, 1.0, &[("recognised", f.recognised), ("support", f.support)])
+                    estimate(
+                        &f.pose,
+                        f.rival.as_ref(),
+                        1.0,
+                        &[("recognised", f.recognised), ("support", f.support)],
+                    )
                 })
                 .collect());
         };
         let found =
             views.find(image, query.camera, &region.bbox, keypoints).map_err(EstimatorError::method)?;
-        let Some(found) = found else {
+        let Some((found, rival)) = found else {
             let source = format!(
                 "box {:.0},{:.0},{:.0},{:.0}: expected pixels of the image, found none",
                 region.bbox.x, region.bbox.y, region.bbox.width, region.bbox.height
             );
             return Err(EstimatorError::Region { source: source.into() });
         };
-        Ok(found.first().and_then(|h| estimate(h, region.score, &[])).into_iter().collect())
+        Ok(found.first().and_then(|h| estimate(h, rival.as_ref(), region.score, &[])).into_iter().collect())
     }
 }
 

@@ -21,6 +21,7 @@ mod colour;
 mod crop;
 pub mod detector;
 mod direct;
+mod distinction;
 mod error;
 mod estimate;
 pub mod estimator;

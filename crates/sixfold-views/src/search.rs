@@ -14,7 +14,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use rayon::prelude::*;
 use sixfold_align::outline::projected_box;
 use sixfold_estimator::{EstimatorError, ObjectDetector, Region};
-use sixfold_geometry::{Camera, Pose, Rect, RgbImage, Vec2, Vec3};
+use sixfold_geometry::{Camera, Pose, Rect, RgbImage, Vec2};
 
 use crate::colour::Chroma;
 use crate::error::ViewsError;
@@ -141,6 +141,8 @@ pub(crate) struct Scored<T> {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Found {
     pub(crate) pose: Hypothesis,
+    /// [`Settled::rival`](crate::close::Settled::rival).
+    pub(crate) rival: Option<Hypothesis>,
     /// [`Scored::more`].
     pub(crate) recognised: f64,
     /// Fraction of the squared scores of all examined poses that belongs to those that are alike. Searches that start from different templates end in about
@@ -175,6 +177,10 @@ impl Views<'_> {
             if kept.len() < most && kept.iter().all(|k| !self.one(camera, &k.pose, &found.pose)) {
                 kept.push(found);
             }
+        }
+        for found in kept.iter_mut().take(instances) {
+            let settled = self.settled(found.pose, prints.as_ref(), image, camera)?;
+            (found.pose, found.rival) = (settled.pose, settled.rival);
         }
         Ok(kept)
     }
@@ -274,7 +280,7 @@ impl Views<'_> {
         let mut agreed: Vec<(f64, Found)> = Vec::new();
         for ((scored, votes), support) in poses.iter().zip(votes).zip(supports) {
             let support = support / total.max(f64::MIN_POSITIVE);
-            let found = Found { pose: scored.pose, recognised: scored.more, support };
+            let found = Found { pose: scored.pose, rival: None, recognised: scored.more, support };
             agreed.push((votes + OWN * scored.score.powi(VOTES), found));
         }
         agreed.sort_by(|a, b| b.0.total_cmp(&a.0));
@@ -300,10 +306,9 @@ impl Views<'_> {
 
     /// The corners of the object's bounding box in the image; `None` if one is not before the camera.
     fn corners(&self, camera: &Camera, pose: &Pose) -> Option<[Vec2; 8]> {
-        let (low, high) = self.mesh.bounding_box();
-        let corner = |k: usize| Vec3::from_fn(|i, _| if k >> i & 1 == 0 { low[i] } else { high[i] });
+        let corners = self.mesh.box_corners().into_iter();
         let projected: Vec<Vec2> =
-            (0..8).map_while(|k| camera.project(&pose.transform_point(&corner(k)))).collect();
+            corners.map_while(|corner| camera.project(&pose.transform_point(&corner))).collect();
         projected.try_into().ok()
     }
 
@@ -394,6 +399,7 @@ mod tests {
     use crate::estimate::tests::{part, photographed, without_refiner};
     use crate::recognition::{Appearance, CHANNELS};
     use crate::templates::{TemplateOptions, make_templates};
+    use sixfold_geometry::Vec3;
     use sixfold_geometry::nalgebra::UnitQuaternion;
 
     /// A box of an image as a place.

@@ -2,12 +2,12 @@
 //! with the same arguments.
 
 use std::ffi::OsString;
-use std::path::PathBuf;
 use std::process::Command;
 
 use anyhow::{Context, Result, bail};
 use clap::Args;
 use sixfold_shell::Outcome;
+use sixfold_shell::companion::companion;
 
 /// The program that has the command.
 const PROGRAM: &str = "sixfold-experiments";
@@ -27,7 +27,7 @@ pub(crate) struct Forwarded {
 
 /// Runs the other program with this one's arguments; its exit status becomes this one's.
 pub(crate) fn run() -> Result<Outcome> {
-    let Some(program) = find() else {
+    let Some(program) = companion(PROGRAM) else {
         bail!(
             "this command is run by the program {PROGRAM}, which is neither beside this one nor on PATH: install it with \
              `cargo install --locked --path crates/{PROGRAM}`, or build it in a checkout with `cargo build --release -p {PROGRAM}`"
@@ -36,15 +36,6 @@ pub(crate) fn run() -> Result<Outcome> {
     let mut command = Command::new(&program);
     command.args(std::env::args_os().skip(1));
     become_it(command).with_context(|| format!("cannot run {}", program.display()))
-}
-
-/// The program beside this one, or on PATH.
-fn find() -> Option<PathBuf> {
-    let name = format!("{PROGRAM}{}", std::env::consts::EXE_SUFFIX);
-    let beside = std::env::current_exe().ok().and_then(|me| Some(me.parent()?.join(&name)));
-    let path = std::env::var_os("PATH").unwrap_or_default();
-    let on_path = std::env::split_paths(&path).map(|folder| folder.join(&name));
-    beside.into_iter().chain(on_path).find(|program| program.is_file())
 }
 
 #[cfg(unix)]

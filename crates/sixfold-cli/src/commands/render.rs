@@ -16,7 +16,7 @@ use sixfold_render::{
 
 use sixfold_shell::Outcome;
 use sixfold_shell::folder::OutputFolder;
-use sixfold_shell::output::{JsonArguments, pose_rows, report};
+use sixfold_shell::output::{JsonArguments, report};
 use sixfold_shell::{objects, overlay};
 
 #[derive(Debug, Args)]
@@ -85,7 +85,7 @@ pub(crate) fn run(a: &RenderArguments) -> Result<Outcome> {
     let pixels = frame.mask(0).as_slice().iter().filter(|m| **m).count();
     let value = json!({
         "object": object.name,
-        "camera_from_object": pose_rows(&pose),
+        "camera_from_object": pose.rows(),
         "pixels": pixels,
         "depth_scale_mm": 0.1,
         "files": files,

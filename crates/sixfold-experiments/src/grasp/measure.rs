@@ -18,7 +18,7 @@ use sixfold_shell::Outcome;
 use sixfold_shell::folder::OutputFolder;
 use sixfold_shell::grasp::object_list::{ObjectsArguments, file_name, named_objects};
 use sixfold_shell::grasp::trial::{PhysicsArguments, outcome_name, physics};
-use sixfold_shell::output::{JsonArguments, pose_rows, report};
+use sixfold_shell::output::{JsonArguments, report};
 use sixfold_shell::overlay;
 use sixfold_shell::progress::{Progress, check_interrupt};
 
@@ -155,10 +155,8 @@ impl Tried {
         Tried {
             number,
             ending: result.ending,
-            world_from_object: pose_rows(&result.world_from_object),
-            world_from_gripper: best
-                .zip(world_from_camera)
-                .map(|(g, w)| pose_rows(&(w * g.camera_from_gripper))),
+            world_from_object: result.world_from_object.rows(),
+            world_from_gripper: best.zip(world_from_camera).map(|(g, w)| (w * g.camera_from_gripper).rows()),
             opening: best.map(|g| g.opening),
             quality: best.map(|g| g.quality.total()),
             report: result.report,

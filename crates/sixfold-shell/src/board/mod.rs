@@ -13,8 +13,6 @@ use sixfold_board::{Board, BoardError, CalibrationOptions, Corner, Paper, board_
 use sixfold_geometry::{Camera, Pose, RgbImage, Vec2};
 use sixfold_io::CameraFile;
 
-use crate::output::pose_rows;
-
 pub use self::ends::{Ends, TwoPixels};
 use self::photographs::leave_out_other_sizes;
 pub use self::photographs::{Photograph, photograph_files, read_photographs};
@@ -220,7 +218,7 @@ fn listed(
         Listed {
             file: photograph.file.clone(),
             tags: photograph.tags.len(),
-            camera_from_board: view.map(|v| pose_rows(&v.camera_from_board)),
+            camera_from_board: view.map(|v| v.camera_from_board.rows()),
             rms_px: view.map(|v| v.rms),
             left_out: reason,
             corners: view.map_or_else(Vec::new, |v| corners.iter().zip(&v.residuals).map(corner).collect()),

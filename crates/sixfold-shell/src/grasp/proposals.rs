@@ -8,7 +8,6 @@ use sixfold_grasp::{AntipodalQuality, DrawnGrasp, Grasp, GraspCluster, Gripper, 
 
 use super::planner::Planner;
 use crate::labels::{Label, draw_labels};
-use crate::output::pose_rows;
 use crate::overlay::{caption, depth_picture};
 
 /// The best grasp's colour; the others are blue.
@@ -68,7 +67,7 @@ struct FromExperience {
 impl Proposed {
     fn new(grasp: &Grasp, score: f64, members: usize) -> Proposed {
         Proposed {
-            camera_from_gripper: pose_rows(&grasp.camera_from_gripper),
+            camera_from_gripper: grasp.camera_from_gripper.rows(),
             opening: grasp.opening,
             width: grasp.width,
             quality: grasp.quality.total(),

@@ -15,7 +15,7 @@ use sixfold_simulation::{
 use sixfold_shell::Outcome;
 use sixfold_shell::grasp::trial::{PhysicsArguments, physics};
 use sixfold_shell::objects;
-use sixfold_shell::output::{JsonArguments, pose_rows, report};
+use sixfold_shell::output::{JsonArguments, report};
 
 #[derive(Debug, Args)]
 pub(crate) struct TryArguments {
@@ -100,8 +100,8 @@ pub(super) fn run(a: &TryArguments) -> Result<Outcome> {
     let whole = Whole {
         object: object.name.clone(),
         gripper: gripper.name.clone(),
-        world_from_object: pose_rows(&world_from_object),
-        world_from_gripper: pose_rows(&world_from_gripper),
+        world_from_object: world_from_object.rows(),
+        world_from_gripper: world_from_gripper.rows(),
         opening,
         report: result,
     };

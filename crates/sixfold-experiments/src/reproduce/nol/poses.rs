@@ -15,7 +15,6 @@ use sixfold_nol::refine::{
 };
 
 use super::material::{Material, Poses, Source};
-use sixfold_shell::output::pose_rows;
 
 /// Variants of refinement: key and title.
 pub(super) const WAYS: [(&str, &str); 6] = [
@@ -73,14 +72,12 @@ impl PoseError {
         let (low, high) = mesh.bounding_box();
         let off = |p: Vec3| found.transform_point(&p) - truth.transform_point(&p);
         let d = off((low + high) * 0.5);
-        let corner =
-            |i: usize| Vec3::from_fn(|axis, _| if i >> axis & 1 == 0 { low[axis] } else { high[axis] });
         PoseError {
             distance: d.norm(),
             across: d.xy().norm(),
             along: d.z.abs(),
             turned: found.rotation_angle_to(truth),
-            corners: (0..8).map(|i| off(corner(i)).norm()).sum::<f64>() / 8.0,
+            corners: mesh.box_corners().map(|corner| off(corner).norm()).iter().sum::<f64>() / 8.0,
         }
     }
 }
@@ -160,7 +157,7 @@ pub(super) fn refine(
                 object: s.object,
                 before: PoseError::new(s.photograph.camera_from_object(), &s.truth, mesh),
                 after: PoseError::new(pose, &s.truth, mesh),
-                camera_from_object: pose_rows(pose),
+                camera_from_object: pose.rows(),
                 dropped,
             }
         })
