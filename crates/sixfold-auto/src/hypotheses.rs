@@ -156,25 +156,19 @@ impl Pool<'_> {
         self.hypotheses.sort_by(|a, b| b.probability.total_cmp(&a.probability));
     }
 
-    /// Of poses at one place that are too far apart for two of them to be right, at most one is: with the odds `o` of each by itself, its probability
-    /// is `o / (1 + sum(o))`.
+    /// Shares the probability among poses at one place of which at most one is right.
     fn exclude(&mut self) {
-        let odds: Vec<f64> =
-            self.hypotheses.iter().map(|h| h.probability / (1.0 - h.probability).max(1e-12)).collect();
-        let exclusive = |a: &Hypothesis, b: &Hypothesis| {
+        let excludes = |i: usize, k: usize| {
+            let [a, b] = [&self.hypotheses[i], &self.hypotheses[k]];
             let poses = [a, b].map(|h| &h.estimate.camera_from_object);
-            let apart = distance(poses[0], poses[1], self.symmetries, &self.shape);
-            one_place(a, b) && apart > 2.0 * RIGHT * self.diameter
+            one_place(a, b) && exclude_each_other(poses, self.symmetries, &self.shape, self.diameter)
         };
-        let others = |i: usize| -> f64 {
-            let here = &self.hypotheses[i];
-            let rivals = self.hypotheses.iter().zip(&odds).enumerate().filter(|(k, _)| *k != i);
-            rivals.filter(|(_, (other, _))| exclusive(here, other)).map(|(_, (_, odds))| odds).sum()
-        };
-        let others: Vec<f64> = (0..odds.len()).map(others).collect();
-        for ((h, odds), others) in self.hypotheses.iter_mut().zip(odds).zip(others) {
-            h.probability = odds / (1.0 + odds + others);
-        }
+        let alone: Vec<f64> = self.hypotheses.iter().map(|h| h.probability).collect();
+        let probabilities = exclusive(&alone, excludes);
+        self.hypotheses
+            .iter_mut()
+            .zip(probabilities)
+            .for_each(|(h, probability)| h.probability = probability);
     }
 
     /// The most probable hypotheses, one per place, at most `most`, each with the others at its place that are not much less
@@ -192,6 +186,22 @@ impl Pool<'_> {
         }
         chosen
     }
+}
+
+/// Whether two poses are too far apart for both to be right.
+fn exclude_each_other(poses: [&Pose; 2], symmetries: &[Pose], shape: &Shape<'_>, diameter: f64) -> bool {
+    distance(poses[0], poses[1], symmetries, shape) > 2.0 * RIGHT * diameter
+}
+
+/// The probabilities of events of which some exclude each other: with the odds `o = p / (1 - p)` of each by itself, `o / (1 + sum(o))` over it and
+/// those that it excludes.
+fn exclusive(alone: &[f64], excludes: impl Fn(usize, usize) -> bool) -> Vec<f64> {
+    let odds: Vec<f64> = alone.iter().map(|p| p / (1.0 - p).max(1e-12)).collect();
+    let of = |i: usize| {
+        let others = (0..odds.len()).filter(|k| *k != i && excludes(i, *k)).map(|k| odds[k]);
+        odds[i] / (1.0 + odds[i] + others.sum::<f64>())
+    };
+    (0..odds.len()).map(of).collect()
 }
 
 /// Another pose at the same place is reported if its probability exceeds this fraction of the best one's; chosen by hand, not
@@ -260,6 +270,8 @@ fn shared(a: &[u32], b: &[u32]) -> usize {
 
 #[cfg(test)]
 mod tests {
+    use sixfold_geometry::nalgebra::UnitQuaternion;
+
     use super::*;
 
     #[test]
@@ -278,5 +290,30 @@ mod tests {
         assert_eq!([at(-1.0), at(0.05), at(0.5), at(f64::NAN)], [false, false, true, false]);
         // A scan whose frame is a metre behind it.
         assert!(is_before_camera(&Pose::from_translation(Vec3::new(0.0, 0.0, -0.5)), &mesh(1.0), 0.2));
+    }
+
+    #[test]
+    fn of_equal_poses_that_exclude_each_other_none_is_probable() {
+        let all = exclusive(&[0.9, 0.9, 0.6, 1.0], |i, k| i.max(k) == 1);
+        assert!((all[0] - 9.0 / 19.0).abs() < 1e-12 && all[1] == all[0], "{all:?}");
+        assert!((all[2] - 0.6).abs() < 1e-12 && (all[3] - 1.0).abs() < 1e-9, "{all:?}");
+    }
+
+    #[test]
+    fn two_poses_exclude_each_other_if_the_truth_cannot_be_near_both() {
+        let corners =
+            (0..8).map(|i| Vec3::from_fn(|k, _| if i >> k & 1 == 1 { 0.05 } else { -0.05 })).collect();
+        let mesh = Mesh::new(corners, vec![[0, 1, 2]]).unwrap();
+        let shape = Shape { mesh: &mesh, colored: &mesh, threshold: 0.008 };
+        let diameter = mesh.diameter();
+        let pose = Pose::from_translation(Vec3::z());
+        let beside = |diameters: f64| Pose::from_translation(Vec3::new(diameters * diameter, 0.0, 1.0));
+        let half = UnitQuaternion::from_axis_angle(&Vec3::z_axis(), std::f64::consts::PI);
+        let half = Pose::new(half, Vec3::zeros());
+        let exclude = |other: Pose, symmetries: &[Pose]| {
+            exclude_each_other([&pose, &other], symmetries, &shape, diameter)
+        };
+        assert!(!exclude(beside(0.19), &[]) && exclude(beside(0.21), &[]));
+        assert!(exclude(pose * half, &[]) && !exclude(pose * half, &[half]));
     }
 }

@@ -202,22 +202,6 @@ fn two_poses_that_look_alike_are_both_said() {
 }
 
 #[test]
-fn poses_that_are_both_right_do_not_exclude_each_other() {
-    // A tenth of the diameter apart: either may be nearer to the truth. Far apart, at most one is right.
-    let (depth, _) = images(&wedge());
-    let camera = camera();
-    let query = Query { depth: Some(&depth), max_instances: 2, ..Query::new(&camera) };
-    let alone = found(&[fixed_poses("a", &[truth()])], |_| (), &query, wedge())[0].confidence;
-    let with =
-        |other: Pose| found(&[fixed_poses("a", &[truth(), other])], |_| (), &query, wedge())[0].confidence;
-    let half = Pose::exp(&Vector6::new(0.0, 0.0, 0.0, 0.0, 0.0, std::f64::consts::PI));
-    let rotated = Pose::new(truth().rotation() * half.rotation(), truth().translation());
-    let (near, far) = (with(beside(0.02)), with(rotated));
-    assert!(alone > 0.5 && far < alone, "{alone} {far}");
-    assert!((near - alone).abs() < 0.3, "{near} {alone}");
-}
-
-#[test]
 fn members_that_cannot_run_are_left_out_and_reported() {
     let (depth, _) = images(&wedge());
     let camera = camera();
