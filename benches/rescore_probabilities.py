@@ -4,8 +4,9 @@
     python benches/rescore_probabilities.py OUT crates/sixfold-auto/calibration.json
 
 The rows that `sixfold reproduce auto` keeps contain the numbers from which probabilities are computed, so that a calibration can be measured
-without searching again. Prints how many of the most probable poses are right, how many are reported (0.5 and more) and right, the expected
-calibration error (Naeini et al. 2015, ten bins), and what it would be for exact probabilities (Bröcker and Smith 2007). Needs numpy."""
+without searching again; that poses at one place share their probability is left out. Prints how many of the most probable poses are right, how
+many are reported (0.5 and more) and right, the expected calibration error (Naeini et al. 2015, ten bins), and what it would be for exact
+probabilities (Bröcker and Smith 2007). Needs numpy."""
 
 import json
 import sys

@@ -29,8 +29,9 @@ const MAX_GROWTH: f64 = 4.0;
 const TOLERANCE: f64 = 0.02;
 /// A pose rotated by 180 degrees is refined if the image agrees with it at least this much, relative to the pose itself.
 const ROTATED: f64 = 0.3;
-/// It comes before the pose if they agree with the image about equally, and the image is like it and not like the pose where they differ.
+/// Both agree with the image about equally if the agreements differ by less.
 const ROTATED_TOLERANCE: f64 = 0.15;
+/// The rotated pose comes before the pose if the image is more like it by this much: of 1 where they differ, otherwise in similarity.
 const DISTINCT: f64 = 0.05;
 /// The other of both is reported too if the image agrees with it at most by this much less: prints on scanned meshes are not exact.
 const AS_GOOD: f64 = 0.05;
@@ -88,7 +89,8 @@ impl Views<'_> {
         let rotated = [Vec3::x_axis(), Vec3::y_axis(), Vec3::z_axis()].map(|axis| {
             let half = UnitQuaternion::from_axis_angle(&axis, std::f64::consts::PI);
             let half_rotation = centre * Pose::new(half, Vec3::zeros()) * centre.inverse();
-            Hypothesis { camera_from_object: pose.camera_from_object * half_rotation, ..*pose }
+            let camera_from_object = pose.camera_from_object * half_rotation;
+            Hypothesis { camera_from_object, drawn: 0.0, ..*pose }
         });
         let mut out = Vec::new();
         for hypothesis in rotated {
@@ -104,9 +106,9 @@ impl Views<'_> {
         Ok(out)
     }
 
-    /// A pose, or that rotated by 180 degrees about an axis of the object's bounding box if both agree with the image about equally and the image
-    /// is more like the latter where the object looks different at both ([`distinction`]). With the other of both, if the image agrees with it hardly
-    /// less.
+    /// A pose, or that rotated by 180 degrees about an axis of the object's bounding box if the image is more similar to that. If the image agrees with both
+    /// about equally and something is drawn on the object, what differs between both decides ([`distinction`]). With the other of both, if the image
+    /// agrees with it hardly less.
     pub(crate) fn settled(
         &self,
         pose: Hypothesis,
@@ -119,7 +121,13 @@ impl Views<'_> {
             add_prints(&mut rotated, prints);
             let poses = [&pose.camera_from_object, &rotated.camera_from_object];
             let close = (pose.similarity - rotated.similarity).abs() < ROTATED_TOLERANCE;
-            let towards = if close { distinction(self.mesh, image, camera, poses) } else { 1.0 };
+            // Shading alone does not tell one from the other: without a print the similarity decides.
+            let both_drawn = pose.drawn.min(rotated.drawn) > 0.0;
+            let towards = if close && both_drawn {
+                distinction(self.mesh, image, camera, poses)
+            } else {
+                pose.similarity - rotated.similarity
+            };
             Ok((towards, rotated))
         };
         let rivals = self.rotated(&pose, image, camera)?.into_par_iter().map(rival);
