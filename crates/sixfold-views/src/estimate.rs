@@ -158,6 +158,9 @@ pub(crate) struct Hypothesis {
     pub drawn: f64,
 }
 
+/// Poses, best first, and the rival of the first ([`crate::close::Settled`]).
+type WithRival = (Vec<Hypothesis>, Option<Hypothesis>);
+
 /// Everything that estimating one object's poses needs.
 pub(crate) struct Views<'a> {
     /// Computes features.
@@ -190,7 +193,7 @@ impl Views<'_> {
         camera: &Camera,
         bbox: &Rect,
         keypoints: Option<&ImageKeypoints>,
-    ) -> Result<Option<(Vec<Hypothesis>, Option<Hypothesis>)>, ViewsError> {
+    ) -> Result<Option<WithRival>, ViewsError> {
         let Some(part) = Part::new(self.extractor, image, camera, bbox, self.options.side)? else {
             return Ok(None);
         };
