@@ -11,6 +11,8 @@ use sixfold_synth::augment::{Coverage, Patch};
 use crate::crop::Crop;
 use crate::templates::render;
 
+// All numbers chosen by hand, not swept.
+
 /// Side of the crop, pixels.
 const SIDE: usize = 256;
 /// Ratio of the crop's side to that of the box around both poses.
