@@ -156,7 +156,7 @@ impl Pool<'_> {
         self.hypotheses.sort_by(|a, b| b.probability.total_cmp(&a.probability));
     }
 
-    /// Shares the probability among poses at one place of which at most one is right.
+    /// Divides the probability among poses at one place of which at most one is right.
     fn exclude(&mut self) {
         let excludes = |i: usize, k: usize| {
             let [a, b] = [&self.hypotheses[i], &self.hypotheses[k]];

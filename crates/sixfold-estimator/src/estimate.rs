@@ -19,7 +19,7 @@ pub struct Diagnostic {
 pub struct AlternativePose {
     /// The pose by rows, metres.
     pub camera_from_object: [[f64; 4]; 4],
-    /// Its share of the confidence of all poses of the instance, 0 to 1.
+    /// Its confidence as a fraction of the sum over all poses of the instance, 0 to 1.
     pub weight: f64,
 }
 

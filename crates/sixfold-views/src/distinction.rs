@@ -32,16 +32,14 @@ pub(crate) fn distinction(mesh: &Mesh, image: &RgbImage, camera: &Camera, poses:
     let [Some(first), Some(second)] = boxes else { return 0.0 };
     let Some(crop) = Crop::of_box(camera, &around(&first, &second), MARGIN, SIDE) else { return 0.0 };
     let mut frame = VisibilityBuffer::new(&crop.camera);
-    let renders = poses.map(|pose| {
+    let [(a, shown_a), (b, shown_b)] = poses.map(|pose| {
         let rendered = render(&mut frame, mesh, &crop.to_crop(pose), None);
         let shown = |x, y| f32::from(u8::from(!rendered.coordinates[(x, y)][0].is_nan()));
         (Patch::from_rgb(&rendered.image), Coverage::from_fn(SIDE, SIDE, shown))
     });
-    let both = |x: usize, y: usize| renders.iter().map(|(_, shown)| shown.data[y * SIDE + x]).product();
-    let both = Coverage::from_fn(SIDE, SIDE, both);
+    let both = Coverage::from_fn(SIDE, SIDE, |x, y| shown_a.data[y * SIDE + x] * shown_b.data[y * SIDE + x]);
     let seen = crop.cut(image, camera, [0.5; 3]);
-    let [seen, a, b] =
-        [seen, renders[0].0.clone(), renders[1].0.clone()].map(|patch| normalised(patch, &both));
+    let [seen, a, b] = [seen, a, b].map(|patch| normalised(patch, &both));
     let (mut towards, mut difference) = (0.0f32, 0.0f32);
     for ((i, a), b) in seen.data.iter().zip(&a.data).zip(&b.data) {
         towards += (2.0 * i - a - b) * (a - b);

@@ -16,6 +16,7 @@ fn it_prints_probabilities_and_absent_objects() {
     write_other_part(dir);
     let run = sixfold(dir, &format!("{DEPTH} --object part.ply other.ply --json --out out")).expect(0).json();
     let poses = run["poses"].as_array().unwrap();
+    assert!(poses.iter().all(|pose| pose["alternatives"].is_array()), "{poses:?}");
     assert_eq!(poses.len(), 1, "{poses:?}");
     assert_near(&pose_of(&poses[0]["camera_from_object"]), &case.truth);
     let probability = poses[0]["probability"].as_f64().unwrap();
