@@ -62,6 +62,9 @@ impl PyPoseEstimate {
 fn to_python(py: Python<'_>, estimate: PoseEstimate, camera: &Camera) -> PyResult<PyPoseEstimate> {
     let details = json_to_python(py, &estimate.details)?.cast_into::<PyDict>()?;
     details.set_item("alternatives", json_to_python(py, &estimate.weighted_alternatives())?)?;
+    if let Some(probability) = estimate.probability_with_alternatives() {
+        details.set_item("probability_with_alternatives", probability)?;
+    }
     if let Some(score) = &estimate.verification {
         details.set_item("verification", verification_to_python(py, score)?)?;
     }

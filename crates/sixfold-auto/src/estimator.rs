@@ -70,7 +70,8 @@ impl AutoEstimator {
         AutoEstimator { calibration: Arc::new(calibration), ..self }
     }
 
-    /// All hypotheses for an object in an image: the poses of all methods that ran, the most probable first.
+    /// All hypotheses for an object in an image: the poses of all methods that ran, the most probable first; and the estimates made of
+    /// them, also those below the query's minimum confidence.
     ///
     /// # Errors
     /// [`EstimatorError`], passed on from the method that fails; [`EstimatorError::Lacks`] for an object without a mesh.
@@ -78,11 +79,14 @@ impl AutoEstimator {
         &self,
         object: &AutoObject,
         query: &Query<'_>,
-    ) -> Result<Vec<Hypothesis>, EstimatorError> {
+    ) -> Result<(Vec<Hypothesis>, Vec<PoseEstimate>), EstimatorError> {
         let Some(surface) = &object.surface else {
             return Err(lacks_mesh(object));
         };
-        self.pool((object, surface), query, |pool, _| Ok(pool.hypotheses))
+        self.pool((object, surface), query, |pool, _| {
+            let estimates = pool.estimates(query.max_instances);
+            Ok((pool.hypotheses, estimates))
+        })
     }
 
     /// The first method that can find an object without a mesh, with the object prepared for it.
@@ -376,11 +380,8 @@ impl PoseEstimator for AutoEstimator {
             return self.answer_of_one(object, query);
         };
         self.pool((object, surface), query, |pool, notes| {
-            let chosen = pool.chosen(query.max_instances).into_iter();
-            let mut found: Vec<PoseEstimate> = chosen
-                .filter(|(h, _)| h.probability >= query.min_confidence)
-                .map(|(h, o)| reported(h, &o))
-                .collect();
+            let mut found = pool.estimates(query.max_instances);
+            found.retain(|e| e.probability_with_alternatives() >= Some(query.min_confidence));
             if let Some(first) = found.first_mut() {
                 first.notes.extend(notes);
             }
@@ -390,10 +391,13 @@ impl PoseEstimator for AutoEstimator {
 }
 
 /// A hypothesis as it is reported.
-fn reported(hypothesis: &Hypothesis, others: &[&Hypothesis]) -> PoseEstimate {
+pub(crate) fn reported(hypothesis: &Hypothesis, others: &[&Hypothesis]) -> PoseEstimate {
     let evidence = &hypothesis.evidence;
     let estimate = &hypothesis.estimate;
-    let alternative = |h: &&Hypothesis| PoseEstimate::new(h.estimate.camera_from_object, h.probability);
+    let alternative = |h: &&Hypothesis| PoseEstimate {
+        probability: Some(h.probability),
+        ..PoseEstimate::new(h.estimate.camera_from_object, h.probability)
+    };
     let numbers: Map<String, Value> = NAMES
         .iter()
         .zip(&hypothesis.numbers)

@@ -8,6 +8,7 @@ use sixfold_geometry::{Pose, Vec3};
 use sixfold_mesh::Mesh;
 
 use crate::calibration::Calibration;
+use crate::estimator::reported;
 use crate::lookalikes::LookAlikes;
 use crate::numbers::{Numbers, Reported, add_others, of_evidence, strength};
 
@@ -159,9 +160,7 @@ impl Pool<'_> {
     /// Divides the probability among poses at one place of which at most one is right.
     fn exclude(&mut self) {
         let excludes = |i: usize, k: usize| {
-            let [a, b] = [&self.hypotheses[i], &self.hypotheses[k]];
-            let poses = [a, b].map(|h| &h.estimate.camera_from_object);
-            one_place(a, b) && exclude_each_other(poses, self.symmetries, &self.shape, self.diameter)
+            one_place(&self.hypotheses[i], &self.hypotheses[k]) && self.exclude_each_other(i, k)
         };
         let alone: Vec<f64> = self.hypotheses.iter().map(|h| h.probability).collect();
         let probabilities = exclusive(&alone, excludes);
@@ -172,25 +171,54 @@ impl Pool<'_> {
     }
 
     /// The most probable hypotheses, one per place, at most `most`, each with the others at its place that are not much less
-    /// probable.
+    /// probable. Of a hypothesis and its others at most one is right.
     pub(crate) fn chosen(&self, most: usize) -> Vec<(&Hypothesis, Vec<&Hypothesis>)> {
-        let mut chosen: Vec<(&Hypothesis, Vec<&Hypothesis>)> = vec![];
-        for hypothesis in &self.hypotheses {
-            if let Some((best, others)) = chosen.iter_mut().find(|(best, _)| one_place(best, hypothesis)) {
-                if hypothesis.probability > ALTERNATIVE * best.probability {
-                    others.push(hypothesis);
-                }
-            } else if chosen.len() < most {
-                chosen.push((hypothesis, vec![]));
-            }
-        }
-        chosen
+        let probabilities: Vec<f64> = self.hypotheses.iter().map(|h| h.probability).collect();
+        let one_place = |i: usize, k: usize| one_place(&self.hypotheses[i], &self.hypotheses[k]);
+        let of = |i: usize| &self.hypotheses[i];
+        grouped(&probabilities, most, one_place, |i, k| self.exclude_each_other(i, k))
+            .into_iter()
+            .map(|(best, others)| (of(best), others.into_iter().map(of).collect()))
+            .collect()
+    }
+
+    /// Whether two hypotheses are too far apart for both to be right.
+    fn exclude_each_other(&self, i: usize, k: usize) -> bool {
+        let poses = [i, k].map(|i| &self.hypotheses[i].estimate.camera_from_object);
+        exclude_each_other(poses, self.symmetries, &self.shape, self.diameter)
+    }
+
+    /// The most probable hypotheses as estimates, one per place, at most `most`.
+    pub(crate) fn estimates(&self, most: usize) -> Vec<PoseEstimate> {
+        self.chosen(most).into_iter().map(|(best, others)| reported(best, &others)).collect()
     }
 }
 
 /// Whether two poses are too far apart for both to be right.
 fn exclude_each_other(poses: [&Pose; 2], symmetries: &[Pose], shape: &Shape<'_>, diameter: f64) -> bool {
     distance(poses[0], poses[1], symmetries, shape) > 2.0 * RIGHT * diameter
+}
+
+/// Hypotheses in the order of their probabilities, one per place, at most `most`, each with the others at its place that are not much less probable
+/// and exclude it and each other.
+fn grouped(
+    probabilities: &[f64],
+    most: usize,
+    one_place: impl Fn(usize, usize) -> bool,
+    excludes: impl Fn(usize, usize) -> bool,
+) -> Vec<(usize, Vec<usize>)> {
+    let mut chosen: Vec<(usize, Vec<usize>)> = vec![];
+    for (new, probability) in probabilities.iter().enumerate() {
+        if let Some((best, others)) = chosen.iter_mut().find(|(best, _)| one_place(*best, new)) {
+            let probable = *probability > ALTERNATIVE * probabilities[*best];
+            if probable && excludes(*best, new) && others.iter().all(|other| excludes(*other, new)) {
+                others.push(new);
+            }
+        } else if chosen.len() < most {
+            chosen.push((new, vec![]));
+        }
+    }
+    chosen
 }
 
 /// The probabilities of events of which some exclude each other: with the odds `o = p / (1 - p)` of each by itself, `o / (1 + sum(o))` over it and
@@ -297,6 +325,19 @@ mod tests {
         let all = exclusive(&[0.9, 0.9, 0.6, 1.0], |i, k| i.max(k) == 1);
         assert!((all[0] - 9.0 / 19.0).abs() < 1e-12 && all[1] == all[0], "{all:?}");
         assert!((all[2] - 0.6).abs() < 1e-12 && (all[3] - 1.0).abs() < 1e-9, "{all:?}");
+    }
+
+    #[test]
+    fn a_pose_is_reported_with_those_at_its_place_that_exclude_it() {
+        // Places 0 and 1 of poses 0 to 5; poses 1 and 2 are near each other, 5 is improbable.
+        let place = [0, 0, 0, 1, 0, 0];
+        let near = |i: usize, k: usize| [i.min(k), i.max(k)] == [1, 2];
+        let of = |most| {
+            let probabilities = [0.4, 0.3, 0.25, 0.2, 0.15, 0.09];
+            grouped(&probabilities, most, |i, k| place[i] == place[k], |i, k| !near(i, k))
+        };
+        assert_eq!(of(2), [(0, vec![1, 4]), (3, vec![])]);
+        assert_eq!(of(1), [(0, vec![1, 4])]);
     }
 
     #[test]

@@ -199,6 +199,14 @@ fn two_poses_that_look_alike_are_both_said() {
     // Only one of both is right.
     let sum = poses[0].confidence + poses[0].alternatives[0].confidence;
     assert!(sum > 0.3 && sum < 1.0 && poses[0].confidence < 0.5, "{poses:?}");
+    assert_eq!(poses[0].probability_with_alternatives(), Some(sum));
+    // The threshold applies to both together.
+    let at_least = |min_confidence: f64| {
+        let query = Query { min_confidence, ..query.passed_on(1, 0.0) };
+        found(&[fixed_poses("a", &[truth(), rotated])], |_| (), &query, solid(1.0)).len()
+    };
+    assert!(poses[0].confidence < 0.9 * sum, "{poses:?}");
+    assert_eq!([0.95 * sum, 1.05 * sum].map(at_least), [1, 0]);
 }
 
 #[test]

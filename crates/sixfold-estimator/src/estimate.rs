@@ -73,8 +73,31 @@ impl PoseEstimate {
         self.alternatives.iter().map(weighted).collect()
     }
 
+    /// The probability that the pose or one of its alternatives is right, if the method computes it. At most one of them is, so that
+    /// it is their sum.
+    pub fn probability_with_alternatives(&self) -> Option<f64> {
+        let others = self.alternatives.iter().filter_map(|other| other.probability);
+        Some(self.probability? + others.sum::<f64>())
+    }
+
     /// The visible fraction of the object, if verification has computed it.
     pub fn visibility(&self) -> Option<f64> {
         self.verification.map(|v| v.visible_fraction())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_pose_and_its_alternatives_have_weights_and_a_probability() {
+        let one = |p: f64| PoseEstimate { probability: Some(p), ..PoseEstimate::new(Pose::identity(), p) };
+        let estimate = PoseEstimate { alternatives: vec![one(0.25), one(0.125)], ..one(0.5) };
+        assert_eq!(estimate.probability_with_alternatives(), Some(0.875));
+        let weights: Vec<f64> = estimate.weighted_alternatives().iter().map(|a| a.weight).collect();
+        assert_eq!(weights, [0.25 / 0.875, 0.125 / 0.875]);
+        assert_eq!(one(0.5).probability_with_alternatives(), Some(0.5));
+        assert_eq!(PoseEstimate::new(Pose::identity(), 0.5).probability_with_alternatives(), None);
     }
 }

@@ -51,7 +51,10 @@ pub struct Query<'a> {
     pub max_instances: usize,
     /// How many of these are wanted only to see how certain the others are: a method need not spend time on finding them.
     pub runners_up: usize,
-    /// Estimates with a lower confidence are left out; 0 or more. Confidences are 0 to 1, so a value above 1 leaves out all.
+    /// Estimates with a lower confidence (or, with probabilities, [`probability_with_alternatives`]) are left out; 0 or more. Confidences are
+    /// 0 to 1, so a value above 1 leaves out all.
+    ///
+    /// [`probability_with_alternatives`]: crate::PoseEstimate::probability_with_alternatives
     pub min_confidence: f64,
     /// Whether images for people are wanted.
     pub diagnostics: bool,

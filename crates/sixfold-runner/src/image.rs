@@ -92,6 +92,9 @@ pub struct FoundPose {
     /// Probability that the pose is right, if the method computes it.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub probability: Option<f64>,
+    /// Probability that the pose or one of its alternatives is right, if the method computes probabilities.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub probability_with_alternatives: Option<f64>,
     /// Score of verification by rendering.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub verification: Option<VerificationScore>,
@@ -117,6 +120,7 @@ impl FoundPose {
             confidence: estimate.confidence,
             alternatives: estimate.weighted_alternatives(),
             probability: estimate.probability,
+            probability_with_alternatives: estimate.probability_with_alternatives(),
             verification: estimate.verification,
             details,
             elapsed: found.seconds,

@@ -24,6 +24,13 @@ pub fn pose_table(report: &ImageReport) -> String {
             t.join(" "),
             pose.elapsed
         );
+        if let Some(together) = pose.probability_with_alternatives.filter(|_| !pose.alternatives.is_empty()) {
+            let poses = pose.alternatives.len() + 1;
+            let _ = writeln!(
+                text,
+                "  ambiguous: {poses} possible poses (alternatives in --json), together {together:.3}"
+            );
+        }
     }
     for name in &report.not_found {
         let _ = writeln!(text, "{name:<24} not found");

@@ -14,6 +14,13 @@ function choice(object, chosen) {
   return element("label", { className: "choice" }, [input, image, element("span", { className: "name" }, [object.name])]);
 }
 
+function certainty(pose) {
+  if (pose.probability === undefined) return pose.confidence.toFixed(2);
+  const percent = (value) => `${(100 * value).toFixed(0)} %`;
+  const together = `${percent(pose.probability_with_alternatives)} one of ${pose.alternatives.length + 1} poses`;
+  return percent(pose.probability) + (pose.alternatives.length ? ` (${together})` : "");
+}
+
 function found(result) {
   const status = [];
   if (result.poses.length === 0) status.push(element("p", {}, ["No pose was found with a sufficient confidence."]));
@@ -26,7 +33,7 @@ function found(result) {
     const at = pose.camera_from_object.slice(0, 3).map((row) => (1000 * row[3]).toFixed(1));
     return [
       [swatch, pose.object],
-      pose.probability === undefined ? pose.confidence.toFixed(2) : `${(100 * pose.probability).toFixed(0)} %`,
+      certainty(pose),
       pose.visibility === null ? "" : `${(100 * pose.visibility).toFixed(0)} %`,
       at.join("  "),
       pose.search_seconds.toFixed(2),

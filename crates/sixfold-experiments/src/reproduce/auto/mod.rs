@@ -124,6 +124,8 @@ struct Search {
     present: bool,
     /// All poses found, the most probable first.
     poses: Vec<FoundPose>,
+    /// The most probable pose together with its alternatives.
+    together: Option<Together>,
     /// Whether the most probable pose is reported, but not when all these objects are searched at once: most of its pixels belong to a
     /// more probable pose of another.
     overruled: bool,
@@ -136,6 +138,15 @@ struct FoundPose {
     method: String,
     numbers: Numbers,
     probability: f64,
+    right: bool,
+}
+
+/// A pose together with its alternatives.
+#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
+struct Together {
+    /// The probability that one of them is right.
+    probability: f64,
+    /// Whether one of them is.
     right: bool,
 }
 
@@ -352,20 +363,22 @@ fn search<'k>(
             .collect();
         let start = std::time::Instant::now();
         let object: &AutoObject = downcast(known.prepared.as_ref(), "auto")?;
-        let found = auto.hypotheses(object, &query)?;
+        let (found, estimates) = auto.hypotheses(object, &query)?;
         let seconds = start.elapsed().as_secs_f64();
-        if let Some(best) = found.first().filter(|h| h.probability >= table::REPORTED) {
-            reported.push(PoseEstimate {
-                probability: Some(best.probability),
-                mask: Some(best.evidence.pixels.clone()),
-                ..best.estimate.clone()
-            });
-            of.push(searches.len());
-        }
         let right = |pose: &Pose| {
             let off = |t: &Pose| mssd(&known.points, pose, t, &known.symmetries);
             truths.iter().any(|t| off(t) < RIGHT * known.diameter)
         };
+        let best = estimates.into_iter().next();
+        let together = best.as_ref().and_then(|best| {
+            let mut all = std::iter::once(best).chain(&best.alternatives);
+            let right = all.any(|e| right(&e.camera_from_object));
+            Some(Together { probability: best.probability_with_alternatives()?, right })
+        });
+        if let Some(best) = best.filter(|_| together.is_some_and(|t| t.probability >= table::REPORTED)) {
+            reported.push(best);
+            of.push(searches.len());
+        }
         let poses = found
             .iter()
             .map(|h| FoundPose {
@@ -376,7 +389,15 @@ fn search<'k>(
             })
             .collect();
         let object = known.name.clone();
-        searches.push(Search { object, given, present: id.is_some(), poses, overruled: false, seconds });
+        searches.push(Search {
+            object,
+            given,
+            present: id.is_some(),
+            poses,
+            together,
+            overruled: false,
+            seconds,
+        });
     }
     let stands = left_standing(&reported.iter().collect::<Vec<_>>());
     for (number, stands) in of.into_iter().zip(stands) {

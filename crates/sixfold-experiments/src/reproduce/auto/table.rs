@@ -43,9 +43,12 @@ pub(super) struct Row {
     pub absent: usize,
     /// Fraction of these that is reported nevertheless.
     pub accepted: f64,
-    /// The three fractions when the objects of an image are searched at once, as by `sixfold estimate` with all of them: a pose most of
-    /// whose pixels belong to a more probable one is not reported.
-    pub at_once: AtOnce,
+    /// The three fractions of the poses together with their alternatives, as `sixfold estimate` reports them: `kept` of those of which
+    /// one is right, with a probability of at least [`REPORTED`] that one is.
+    pub together: Fractions,
+    /// The same when the objects of an image are searched at once, as by `sixfold estimate` with all of them: a pose most of whose pixels
+    /// belong to a more probable one is not reported.
+    pub at_once: Fractions,
     /// Expected calibration error of the best poses (Naeini et al. 2015, ten bins).
     pub expected_error: f64,
     /// The same for exact probabilities: the mean over random draws in which each of these poses is right with its probability. It is
@@ -59,9 +62,9 @@ pub(super) struct Row {
     pub bins: Vec<Bin>,
 }
 
-/// What is reported when the objects of an image are searched at once.
+/// What is reported.
 #[derive(Debug, Serialize)]
-pub(super) struct AtOnce {
+pub(super) struct Fractions {
     /// As [`Row::kept`].
     pub kept: f64,
     /// As [`Row::precision`].
@@ -93,17 +96,21 @@ fn row(given: Given, searches: &[Search]) -> Option<Row> {
     let best: Vec<(bool, f64, bool)> = of.iter().filter_map(|s| judged(s)).collect();
     let present = of.iter().filter(|s| s.present).count();
     let absent = of.len() - present;
-    let right = best.iter().filter(|(_, _, right)| *right).count();
     // Which fraction of the right poses is among these, which fraction of these is right, and which of the absent objects has one.
-    let fractions = |poses: &[(bool, f64, bool)]| {
+    let fractions = |poses: &[(bool, f64, bool)], right: usize| {
         let reported = poses.iter().filter(|(_, p, _)| *p >= REPORTED);
         let reported_right = reported.clone().filter(|(_, _, right)| *right).count();
         let accepted = reported.clone().filter(|(there, _, _)| !there).count();
         let (kept, precision) = (fraction(reported_right, right), fraction(reported_right, reported.count()));
-        AtOnce { kept, precision, accepted: fraction(accepted, absent) }
+        Fractions { kept, precision, accepted: fraction(accepted, absent) }
     };
-    let AtOnce { kept, precision, accepted } = fractions(&best);
-    let left: Vec<(bool, f64, bool)> = of.iter().filter(|s| !s.overruled).filter_map(|s| judged(s)).collect();
+    let count = |poses: &[(bool, f64, bool)]| poses.iter().filter(|(_, _, right)| *right).count();
+    let right = count(&best);
+    let Fractions { kept, precision, accepted } = fractions(&best, right);
+    let with_others = |s: &&&Search| s.together.map(|t| (s.present, t.probability, t.right));
+    let together: Vec<(bool, f64, bool)> = of.iter().filter_map(|s| with_others(&s)).collect();
+    let left: Vec<(bool, f64, bool)> =
+        of.iter().filter(|s| !s.overruled).filter_map(|s| with_others(&s)).collect();
     let bins = binned(best.iter().map(|(_, p, right)| (*p, *right)));
     let drawn = |draw: u64| {
         let mut random = stream(0, draw);
@@ -117,7 +124,8 @@ fn row(given: Given, searches: &[Search]) -> Option<Row> {
         precision,
         absent,
         accepted,
-        at_once: fractions(&left),
+        together: fractions(&together, count(&together)),
+        at_once: fractions(&left, count(&together)),
         expected_error: error(&bins),
         error_by_chance: (0..DRAWS).map(drawn).sum::<f64>() / DRAWS as f64,
         auc: auc(&best),
@@ -198,13 +206,22 @@ pub(super) fn markdown(whole: &Whole) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::FoundPose;
+    use super::super::{FoundPose, Together};
     use super::*;
 
     fn search(present: bool, probability: f64, right: bool) -> Search {
         let numbers = [None; sixfold_auto::NAMES.len()];
         let poses = vec![FoundPose { method: "ppf".into(), numbers, probability, right }];
-        Search { object: "a".into(), given: Given::Depth, present, poses, overruled: false, seconds: 2.0 }
+        let together = Some(Together { probability, right });
+        Search {
+            object: "a".into(),
+            given: Given::Depth,
+            present,
+            poses,
+            together,
+            overruled: false,
+            seconds: 2.0,
+        }
     }
 
     #[test]
@@ -235,6 +252,16 @@ mod tests {
             (again.at_once.kept, again.at_once.precision, again.at_once.accepted),
             (1.0 / 3.0, 0.5, 0.0)
         );
+        assert_eq!((again.together.kept, again.together.accepted), (r.kept, r.accepted));
+        // With its alternatives the right pose of 0.35 is reported, and so is the absent object's pose; the wrong one of 0.65 has a right
+        // alternative.
+        searches[2].together = Some(Together { probability: 0.55, right: true });
+        searches[5].together = Some(Together { probability: 0.5, right: false });
+        searches[3].together = Some(Together { probability: 0.65, right: true });
+        let all = &Whole::of(&searches).rows[0];
+        assert_eq!((all.kept, all.precision, all.accepted), (r.kept, r.precision, r.accepted));
+        assert_eq!((all.together.kept, all.together.precision, all.together.accepted), (1.0, 4.0 / 6.0, 1.0));
+        assert_eq!((all.at_once.kept, all.at_once.precision, all.at_once.accepted), (0.75, 0.75, 0.5));
         // .05 in the bins of two poses, .65 in two of one, .75, .05 in one of one each.
         let expected = (2.0 * 0.05 + 0.65 + 0.65 + 0.75 + 0.05) / 6.0;
         assert!((r.expected_error - expected).abs() < 1e-9, "{}", r.expected_error);
