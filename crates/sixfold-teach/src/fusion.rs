@@ -12,6 +12,8 @@ const SMOOTH: f64 = 1.2;
 /// Cosine of the angle between the outward direction and the direction to a camera below which the camera sees a wall from inside. Chosen
 /// by hand, not swept: views along a wall have to count, they made the hull.
 const INSIDE: f64 = -0.25;
+/// Depth of [`Carving::noise`], metres.
+const NOISE_DEPTH: f64 = 0.5;
 
 /// What may be carved from a hull.
 pub(crate) struct Carving {
@@ -22,6 +24,10 @@ pub(crate) struct Carving {
     /// Thickness of a wall, metres: what is nearer to the hull's surface is carved only by views from outside. Else noise in the depth of
     /// a bowl's inside makes holes in the bowl.
     pub wall: f64,
+    /// Standard deviation of a depth of half a metre, metres; it grows with the square of the depth, as that of stereo cameras. As near as
+    /// `wall` to the hull's surface, which is more precise, depth carves only what it shows to be empty by more than the standard
+    /// deviation of its mean.
+    pub noise: f64,
 }
 
 /// Carves from a hull the space that depth shows to be empty.
@@ -54,10 +60,10 @@ fn distance(
     outwards: Option<Vec3>,
     views: &[View],
     depths: &[DepthImage],
-    Carving { reach, minimum, .. }: &Carving,
+    Carving { reach, minimum, noise, .. }: &Carving,
 ) -> Option<f32> {
     let outwards = outwards.and_then(|o| o.try_normalize(1e-9));
-    let (mut sum, mut weight) = (0.0, 0.0);
+    let (mut sum, mut weight, mut variance) = (0.0f32, 0.0f32, 0.0f64);
     for (view, depth) in views.iter().zip(depths) {
         if outwards.is_some_and(|o| o.dot(&(view.eye - point).normalize()) < INSIDE) {
             continue;
@@ -69,8 +75,10 @@ fn distance(
         }
         sum += (measured - z).min(*reach) as f32;
         weight += 1.0;
+        variance += (noise * (z / NOISE_DEPTH).powi(2)).powi(2);
     }
-    (weight >= *minimum).then(|| sum / weight)
+    let margin = if outwards.is_some() { variance.sqrt() as f32 } else { 0.0 };
+    (weight >= *minimum).then(|| (sum - margin) / weight)
 }
 
 #[cfg(test)]
@@ -80,9 +88,8 @@ mod tests {
     use super::*;
     use crate::view::Volume;
 
-    #[test]
-    fn the_far_side_of_a_wall_is_not_carved_by_wrong_depth_of_its_near_side() {
-        // A wall of 10 mm across z; the camera is half a metre before it and measures 8 mm behind it.
+    /// Whether a point on the z axis is left of a wall of 10 mm across z, of which one camera half a metre before it measures the depth.
+    fn left(measured: f32, carving: &Carving, z: f64) -> bool {
         let volume = Volume { low: Vec3::repeat(-0.01), high: Vec3::repeat(0.01) };
         let wall = Grid::new(&volume, 20, |p| (p.z.abs() - 0.005) as f32);
         let camera =
@@ -92,14 +99,31 @@ mod tests {
         let image = Image::filled(80, 80, [0; 3]);
         let view =
             View { image, camera, camera_from_world: pose, eye, depth: None, mask: None, hidden: None };
-        let depth = Image::filled(80, 80, 0.513);
+        let depth = Image::filled(80, 80, measured);
+        let left = carved(&wall, std::slice::from_ref(&view), std::slice::from_ref(&depth), carving);
+        left.at(&Vec3::new(0.0, 0.0, z)).unwrap() < 0.0
+    }
+
+    #[test]
+    fn the_far_side_of_a_wall_is_not_carved_by_wrong_depth_of_its_near_side() {
+        // The camera measures 8 mm behind the wall.
         let inside = |thickness: f64, z: f64| {
-            let carving = Carving { reach: 0.02, minimum: 1.0, wall: thickness };
-            let left = carved(&wall, std::slice::from_ref(&view), std::slice::from_ref(&depth), &carving);
-            left.at(&Vec3::new(0.0, 0.0, z)).unwrap() < 0.0
+            left(0.513, &Carving { reach: 0.02, minimum: 1.0, wall: thickness, noise: 0.0 }, z)
         };
         assert!(!inside(0.0, 0.004) && !inside(0.0, -0.004), "without a thickness all is carved");
         assert!(inside(0.004, 0.0035), "the far side stays");
         assert!(!inside(0.004, -0.0035), "the near side is carved, the camera is outside");
+    }
+
+    #[test]
+    fn the_surface_is_carved_only_where_depth_is_further_behind_than_its_noise() {
+        let inside = |measured: f32, noise: f64| {
+            left(measured, &Carving { reach: 0.02, minimum: 1.0, wall: 0.004, noise }, -0.0035)
+        };
+        // 1.5 mm behind that point, 3 mm behind the surface.
+        assert!(!inside(0.498, 0.0));
+        assert!(!inside(0.498, 0.001));
+        assert!(inside(0.498, 0.002));
+        assert!(!inside(0.502, 0.002));
     }
 }

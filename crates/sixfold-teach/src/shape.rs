@@ -48,6 +48,13 @@ const LAID_SIDE: usize = 220;
 
 /// Thickness of a wall into which stereo comparison makes no holes, voxels. Chosen by hand.
 const WALL: f64 = 3.0;
+/// The same for measured depth, metres.
+const MEASURED_WALL: f64 = 0.0025;
+/// Standard deviation of measured depth at half a metre, metres.
+const MEASURED_NOISE: f64 = 0.0015;
+/// A measured depth differs from that of the next pixel by more than this at the edge of a surface, metres: there cameras measure depths
+/// between those of both surfaces.
+const JUMP: f32 = 0.01;
 /// Longer side of a view while hollows without texture are compared, pixels.
 const HOLLOW_SIDE: usize = 200;
 /// z of the up direction from which on an object counts as upright in the world.
@@ -482,7 +489,12 @@ pub fn reconstruct(
                 reach: 3.0 * fine.step,
                 minimum: if known.measured { 1.0 } else { 3.0 },
                 // The far side of one view's hull is unknown.
-                wall: if one_side.is_some() { 0.0 } else { WALL * fine.step },
+                wall: match (one_side.is_some(), known.measured) {
+                    (true, _) => 0.0,
+                    (false, true) => (WALL * fine.step).max(MEASURED_WALL),
+                    (false, false) => WALL * fine.step,
+                },
+                noise: if known.measured { MEASURED_NOISE } else { 0.0 },
             };
             let emptied = carved(&fine, &known.views, &known.depths, &carving);
             let upright = floor.map(|f| f.normal).or(capture.up).is_some_and(|up| up.z > UPRIGHT);
@@ -582,7 +594,7 @@ fn depth_of(
     let side = if measured { options.fine_side } else { options.stereo_side };
     let (views, masks) = masked_views(capture, found, volume, side, used);
     let all: Vec<DepthImage> = if measured {
-        views.iter().filter_map(|v| v.depth.clone()).collect()
+        views.par_iter().filter_map(|v| v.depth.as_ref().map(without_edges)).collect()
     } else {
         let mesh = surface(hull)?;
         let reaches: Vec<Reach> = views.par_iter().map(|view| reach(&mesh, view)).collect();
@@ -604,6 +616,18 @@ fn depth_of(
     Some(KnownDepth { views, depths, measured, fraction: known as f64 / pixels.max(1) as f64 })
 }
 
+/// A depth image without the pixels next to a jump in depth.
+fn without_edges(depth: &DepthImage) -> DepthImage {
+    let (width, height) = depth.size();
+    Image::from_fn(width, height, |x, y| {
+        let here = depth[(x, y)];
+        let rows = y.saturating_sub(1)..(y + 2).min(height);
+        let columns = x.saturating_sub(1)..(x + 2).min(width);
+        let jumps = |there: f32| there > 0.0 && (there - here).abs() > JUMP;
+        if rows.into_iter().any(|v| columns.clone().any(|u| jumps(depth[(u, v)]))) { 0.0 } else { here }
+    })
+}
+
 /// The depths at which the rays of a view's pixels enter a closed mesh and first leave it again, with a margin.
 fn reach(mesh: &Mesh, view: &View) -> Reach {
     let depth_of = |mesh: &Mesh| {
@@ -618,4 +642,17 @@ fn reach(mesh: &Mesh, view: &View) -> Reach {
     let back =
         back.map_or_else(|_| front.clone(), |back| depth_of(&back)).map(|d| d + BEYOND * f32::from(*d > 0.0));
     Reach { front, back }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pixels_at_the_edge_of_a_surface_have_no_depth() {
+        // A surface at 0.5 m before a table at 0.6 m, with depths between both at its edge; a slope; a pixel without depth.
+        let depth = Image::from_vec(9, 1, vec![0.5, 0.5, 0.52, 0.595, 0.6, 0.6, 0.605, 0.0, 0.61f32]).unwrap();
+        let left = without_edges(&depth);
+        assert_eq!(left.as_slice(), [0.5, 0.0, 0.0, 0.0, 0.6, 0.6, 0.605, 0.0, 0.61]);
+    }
 }
