@@ -594,25 +594,29 @@ fn depth_of(
     let side = if measured { options.fine_side } else { options.stereo_side };
     let (views, masks) = masked_views(capture, found, volume, side, used);
     let all: Vec<DepthImage> = if measured {
-        views.par_iter().filter_map(|v| v.depth.as_ref().map(without_edges)).collect()
+        views.iter().filter_map(|v| v.depth.clone()).collect()
     } else {
         let mesh = surface(hull)?;
         let reaches: Vec<Reach> = views.par_iter().map(|view| reach(&mesh, view)).collect();
         depths(&views, &reaches, &StereoOptions::default())
     };
     // Keep only depth of the object, not of its surroundings.
-    let depths: Vec<DepthImage> = all
-        .iter()
-        .zip(&masks)
-        .zip(&views)
-        .map(|((depth, mask), view)| {
-            Image::from_fn(depth.width(), depth.height(), |x, y| {
-                if mask[(x, y)] && !view.is_hidden((x, y)) { depth[(x, y)] } else { 0.0 }
-            })
+    let shows_object = |k: usize, pixel: (usize, usize)| masks[k][pixel] && !views[k].is_hidden(pixel);
+    let depths: Vec<DepthImage> = (0..all.len())
+        .into_par_iter()
+        .map(|k| {
+            let depth = if measured { without_edges(&all[k]) } else { all[k].clone() };
+            let (width, height) = depth.size();
+            Image::from_fn(width, height, |x, y| if shows_object(k, (x, y)) { depth[(x, y)] } else { 0.0 })
         })
         .collect();
     let pixels = masks.iter().map(|m| m.as_slice().iter().filter(|v| **v).count()).sum::<usize>();
-    let known = depths.iter().map(|d| d.as_slice().iter().filter(|v| **v > 0.0).count()).sum::<usize>();
+    let known = |k: usize| {
+        let depth = &all[k];
+        let pixels = (0..depth.height()).flat_map(|y| (0..depth.width()).map(move |x| (x, y)));
+        pixels.filter(|pixel| depth[*pixel] > 0.0 && shows_object(k, *pixel)).count()
+    };
+    let known: usize = (0..all.len()).map(known).sum();
     Some(KnownDepth { views, depths, measured, fraction: known as f64 / pixels.max(1) as f64 })
 }
 
