@@ -3,7 +3,6 @@
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::time::{Duration, Instant};
 
-use serde_json::{Map, Value, json};
 use sixfold_align::evidence::{Scene, Shape};
 use sixfold_align::{ColorGradients, DepthOptions, VerificationMesh, VerificationOptions};
 use sixfold_estimator::{
@@ -16,7 +15,6 @@ use sixfold_mesh::Mesh;
 use crate::calibration::{Calibration, CalibrationError};
 use crate::hypotheses::{Hypothesis, Pool};
 use crate::lookalikes::LookAlikes;
-use crate::numbers::NAMES;
 
 const METHOD: &str = "auto";
 /// File of the mesh that is rendered; shared with template matching.
@@ -387,34 +385,5 @@ impl PoseEstimator for AutoEstimator {
             }
             Ok(found)
         })
-    }
-}
-
-/// A hypothesis as it is reported.
-pub(crate) fn reported(hypothesis: &Hypothesis, others: &[&Hypothesis]) -> PoseEstimate {
-    let evidence = &hypothesis.evidence;
-    let estimate = &hypothesis.estimate;
-    let alternative = |h: &&Hypothesis| PoseEstimate {
-        probability: Some(h.probability),
-        ..PoseEstimate::new(h.estimate.camera_from_object, h.probability)
-    };
-    let numbers: Map<String, Value> = NAMES
-        .iter()
-        .zip(&hypothesis.numbers)
-        .filter_map(|(n, v)| Some(((*n).to_owned(), json!((*v)?))))
-        .collect();
-    PoseEstimate {
-        probability: Some(hypothesis.probability),
-        verification: evidence.depth.map(|d| d.score),
-        mask: Some(evidence.pixels.clone()),
-        alternatives: others.iter().map(alternative).collect(),
-        details: Map::from_iter([
-            ("method".to_owned(), hypothesis.method.into()),
-            ("found_by".to_owned(), json!(hypothesis.found_by)),
-            ("evidence".to_owned(), numbers.into()),
-        ]),
-        diagnostics: estimate.diagnostics.clone(),
-        notes: estimate.notes.clone(),
-        ..PoseEstimate::new(estimate.camera_from_object, hypothesis.probability)
     }
 }

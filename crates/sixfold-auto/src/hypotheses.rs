@@ -1,6 +1,7 @@
 //! Poses of all methods in one pool: compared with the image, merged if they are the same, and compared with each other.
 
 use rayon::prelude::*;
+use serde_json::{Map, Value, json};
 use sixfold_align::evidence::{EvidenceCollector, Scene, Shape};
 use sixfold_align::{Evidence, VerificationOptions, Verifier, align_to_depth, refine};
 use sixfold_estimator::{Need, PoseEstimate, PoseEstimator};
@@ -8,9 +9,8 @@ use sixfold_geometry::{Pose, Vec3};
 use sixfold_mesh::Mesh;
 
 use crate::calibration::Calibration;
-use crate::estimator::reported;
 use crate::lookalikes::LookAlikes;
-use crate::numbers::{Numbers, Reported, add_others, of_evidence, strength};
+use crate::numbers::{NAMES, Numbers, Reported, add_others, of_evidence, strength};
 
 /// Poses whose points are less than this fraction of the diameter apart are the same; [`SAME_BY_COLOR`] for methods on colour
 /// alone, which have larger errors along the view axis. Chosen by hand; not swept.
@@ -191,6 +191,34 @@ impl Pool<'_> {
     /// The most probable hypotheses as estimates, one per place, at most `most`.
     pub(crate) fn estimates(&self, most: usize) -> Vec<PoseEstimate> {
         self.chosen(most).into_iter().map(|(best, others)| reported(best, &others)).collect()
+    }
+}
+
+/// A hypothesis as it is reported.
+fn reported(hypothesis: &Hypothesis, others: &[&Hypothesis]) -> PoseEstimate {
+    let evidence = &hypothesis.evidence;
+    let estimate = &hypothesis.estimate;
+    let of = |h: &Hypothesis| PoseEstimate {
+        probability: Some(h.probability),
+        ..PoseEstimate::new(h.estimate.camera_from_object, h.probability)
+    };
+    let numbers: Map<String, Value> = NAMES
+        .iter()
+        .zip(&hypothesis.numbers)
+        .filter_map(|(n, v)| Some(((*n).to_owned(), json!((*v)?))))
+        .collect();
+    PoseEstimate {
+        verification: evidence.depth.map(|d| d.score),
+        mask: Some(evidence.pixels.clone()),
+        alternatives: others.iter().map(|other| of(other)).collect(),
+        details: Map::from_iter([
+            ("method".to_owned(), hypothesis.method.into()),
+            ("found_by".to_owned(), json!(hypothesis.found_by)),
+            ("evidence".to_owned(), numbers.into()),
+        ]),
+        diagnostics: estimate.diagnostics.clone(),
+        notes: estimate.notes.clone(),
+        ..of(hypothesis)
     }
 }
 

@@ -1,5 +1,6 @@
 //! Fusion of the depth of several views into one field of signed distances (Curless and Levoy 1996), within the visual
-//! hull.
+//! hull. Near the hull's surface the mean of n depths has to exceed its standard deviation, `sqrt(sum(s^2)) / n` with `s` that of a depth z,
+//! which grows with z^2 (Khoshelham and Elberink 2012); this use of it is ours.
 
 use rayon::prelude::*;
 use sixfold_geometry::{DepthImage, Vec3};

@@ -485,16 +485,15 @@ pub fn reconstruct(
             if let Some(side) = &one_side {
                 side.replace(&known.views, &mut known.depths);
             }
+            let wall = WALL * fine.step;
+            let (wall, noise) =
+                if known.measured { (wall.max(MEASURED_WALL), MEASURED_NOISE) } else { (wall, 0.0) };
             let carving = Carving {
                 reach: 3.0 * fine.step,
                 minimum: if known.measured { 1.0 } else { 3.0 },
                 // The far side of one view's hull is unknown.
-                wall: match (one_side.is_some(), known.measured) {
-                    (true, _) => 0.0,
-                    (false, true) => (WALL * fine.step).max(MEASURED_WALL),
-                    (false, false) => WALL * fine.step,
-                },
-                noise: if known.measured { MEASURED_NOISE } else { 0.0 },
+                wall: if one_side.is_some() { 0.0 } else { wall },
+                noise,
             };
             let emptied = carved(&fine, &known.views, &known.depths, &carving);
             let upright = floor.map(|f| f.normal).or(capture.up).is_some_and(|up| up.z > UPRIGHT);
@@ -601,34 +600,36 @@ fn depth_of(
         depths(&views, &reaches, &StereoOptions::default())
     };
     // Keep only depth of the object, not of its surroundings.
-    let shows_object = |k: usize, pixel: (usize, usize)| masks[k][pixel] && !views[k].is_hidden(pixel);
-    let depths: Vec<DepthImage> = (0..all.len())
-        .into_par_iter()
-        .map(|k| {
-            let depth = if measured { without_edges(&all[k]) } else { all[k].clone() };
-            let (width, height) = depth.size();
-            Image::from_fn(width, height, |x, y| if shows_object(k, (x, y)) { depth[(x, y)] } else { 0.0 })
+    let depths: Vec<DepthImage> = all
+        .iter()
+        .zip(&masks)
+        .zip(&views)
+        .map(|((depth, mask), view)| {
+            Image::from_fn(depth.width(), depth.height(), |x, y| {
+                if mask[(x, y)] && !view.is_hidden((x, y)) { depth[(x, y)] } else { 0.0 }
+            })
         })
         .collect();
     let pixels = masks.iter().map(|m| m.as_slice().iter().filter(|v| **v).count()).sum::<usize>();
-    let known = |k: usize| {
-        let depth = &all[k];
-        let pixels = (0..depth.height()).flat_map(|y| (0..depth.width()).map(move |x| (x, y)));
-        pixels.filter(|pixel| depth[*pixel] > 0.0 && shows_object(k, *pixel)).count()
+    let known = depths.iter().map(|d| d.as_slice().iter().filter(|v| **v > 0.0).count()).sum::<usize>();
+    let depths = if measured {
+        depths.par_iter().zip(&all).map(|(depth, whole)| without_edges(depth, whole)).collect()
+    } else {
+        depths
     };
-    let known: usize = (0..all.len()).map(known).sum();
     Some(KnownDepth { views, depths, measured, fraction: known as f64 / pixels.max(1) as f64 })
 }
 
-/// A depth image without the pixels next to a jump in depth.
-fn without_edges(depth: &DepthImage) -> DepthImage {
-    let (width, height) = depth.size();
+/// A part of a depth image without the pixels next to a jump in the whole image.
+fn without_edges(part: &DepthImage, whole: &DepthImage) -> DepthImage {
+    let (width, height) = part.size();
     Image::from_fn(width, height, |x, y| {
-        let here = depth[(x, y)];
+        let here = part[(x, y)];
         let rows = y.saturating_sub(1)..(y + 2).min(height);
         let columns = x.saturating_sub(1)..(x + 2).min(width);
         let jumps = |there: f32| there > 0.0 && (there - here).abs() > JUMP;
-        if rows.into_iter().any(|v| columns.clone().any(|u| jumps(depth[(u, v)]))) { 0.0 } else { here }
+        let at_edge = || rows.into_iter().any(|v| columns.clone().any(|u| jumps(whole[(u, v)])));
+        if here > 0.0 && at_edge() { 0.0 } else { here }
     })
 }
 
@@ -657,7 +658,7 @@ mod tests {
         // A surface at 0.5 m before a table at 0.6 m, with depths between both at its edge; a slope; a pixel without depth.
         let depth =
             Image::from_vec(9, 1, vec![0.5, 0.5, 0.52, 0.595, 0.6, 0.6, 0.605, 0.0, 0.61f32]).unwrap();
-        let left = without_edges(&depth);
+        let left = without_edges(&depth, &depth);
         assert_eq!(left.as_slice(), [0.5, 0.0, 0.0, 0.0, 0.6, 0.6, 0.605, 0.0, 0.61]);
     }
 }

@@ -137,8 +137,8 @@ pub(crate) struct CommonArguments {
     #[arg(long, value_name = "DIR", requires = "dataset", conflicts_with_all = OF_ONE_IMAGE)]
     pub overlays: Option<PathBuf>,
     /// Leave out poses with a lower confidence, 0 to 1 (default: 0.25 for one image and 0.05 for a dataset with --method ppf, 0.45
-    /// and 0.05 with mttm, 0.4 and 0 with views, 0 with pix2pose; with auto the probability
-    /// that the pose or one of its alternatives is right, 0.5 and 0)
+    /// and 0.05 with mttm, 0.4 and 0 with views, 0 with pix2pose; with auto the probability that
+    /// the pose or one of its alternatives is right, 0.5 and 0)
     #[arg(long, value_name = "SCORE", value_parser = min_score)]
     pub min_score: Option<f64>,
     /// Seed of all random numbers

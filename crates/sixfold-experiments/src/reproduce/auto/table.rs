@@ -107,10 +107,10 @@ fn row(given: Given, searches: &[Search]) -> Option<Row> {
     let count = |poses: &[(bool, f64, bool)]| poses.iter().filter(|(_, _, right)| *right).count();
     let right = count(&best);
     let Fractions { kept, precision, accepted } = fractions(&best, right);
-    let with_others = |s: &&&Search| s.together.map(|t| (s.present, t.probability, t.right));
-    let together: Vec<(bool, f64, bool)> = of.iter().filter_map(|s| with_others(&s)).collect();
+    let with_others = |s: &Search| s.together.map(|t| (s.present, t.probability, t.right));
+    let together: Vec<(bool, f64, bool)> = of.iter().filter_map(|s| with_others(s)).collect();
     let left: Vec<(bool, f64, bool)> =
-        of.iter().filter(|s| !s.overruled).filter_map(|s| with_others(&s)).collect();
+        of.iter().filter(|s| !s.overruled).filter_map(|s| with_others(s)).collect();
     let bins = binned(best.iter().map(|(_, p, right)| (*p, *right)));
     let drawn = |draw: u64| {
         let mut random = stream(0, draw);
