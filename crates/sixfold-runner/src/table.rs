@@ -37,3 +37,52 @@ pub fn pose_table(report: &ImageReport) -> String {
     }
     text
 }
+
+#[cfg(test)]
+mod tests {
+    use sixfold_estimator::PoseEstimate;
+    use sixfold_geometry::{Pose, Vec3};
+
+    use super::*;
+    use crate::image::FoundPose;
+
+    fn found(object: &str, estimate: &PoseEstimate) -> FoundPose {
+        FoundPose {
+            object: object.to_owned(),
+            camera_from_object: estimate.camera_from_object.rows(),
+            confidence: estimate.confidence,
+            probability: estimate.probability,
+            probability_with_alternatives: estimate.probability_with_alternatives(),
+            verification: None,
+            alternatives: estimate.weighted_alternatives(),
+            details: serde_json::Map::new(),
+            elapsed: 1.5,
+        }
+    }
+
+    fn table(poses: Vec<FoundPose>) -> Vec<String> {
+        let report =
+            ImageReport { poses, not_found: vec!["cup".to_owned()], overlay: None, diagnostics: [].into() };
+        pose_table(&report).lines().map(str::to_owned).collect()
+    }
+
+    #[test]
+    fn only_an_ambiguous_pose_has_a_line_for_its_alternatives() {
+        let at = |x, probability| PoseEstimate {
+            probability: Some(probability),
+            ..PoseEstimate::new(Pose::from_translation(Vec3::new(x, 0.0, 0.75)), probability)
+        };
+        let mug = PoseEstimate { alternatives: vec![at(0.1, 0.25), at(0.2, 0.125)], ..at(0.0, 0.375) };
+        let lines = table(vec![found("mug", &mug), found("can", &at(-0.25, 0.875))]);
+        assert_eq!(lines.len(), 5, "{lines:?}");
+        assert!(lines[0].contains("probability") && !lines[0].contains("confidence"), "{}", lines[0]);
+        assert!(lines[1].starts_with("mug") && lines[1].contains(" 0.375 "), "{}", lines[1]);
+        assert!(lines[2].contains("ambiguous: 3 possible poses") && lines[2].ends_with("together 0.750"));
+        assert!(lines[3].contains(" 0.875 ") && lines[3].contains("-0.2500") && lines[3].contains("0.7500"));
+        assert_eq!(lines[4], format!("{:<24} not found", "cup"));
+        // A method without probabilities shows its confidence.
+        let plain = PoseEstimate::new(Pose::identity(), 0.625);
+        let lines = table(vec![found("can", &plain)]);
+        assert!(lines[0].contains("confidence") && lines[1].contains(" 0.625 "), "{lines:?}");
+    }
+}

@@ -35,16 +35,12 @@ pub(super) struct Row {
     pub present: usize,
     /// Fraction of these whose best pose is right.
     pub found: f64,
-    /// Fraction of the right poses with a probability of at least [`REPORTED`].
-    pub kept: f64,
-    /// Fraction of right poses among those with a probability of at least [`REPORTED`].
-    pub precision: f64,
     /// Objects searched in images that do not show them.
     pub absent: usize,
-    /// Fraction of these that is reported nevertheless.
-    pub accepted: f64,
-    /// The three fractions of the poses together with their alternatives, as `sixfold estimate` reports them: `kept` of those of which
-    /// one is right, with a probability of at least [`REPORTED`] that one is.
+    /// By the probabilities of the best poses.
+    #[serde(flatten)]
+    pub single: Fractions,
+    /// By the probabilities of the best poses together with their alternatives, as `sixfold estimate` reports them; right if one of them is.
     pub together: Fractions,
     /// The same when the objects of an image are searched at once, as by `sixfold estimate` with all of them: a pose most of whose pixels
     /// belong to a more probable one is not reported.
@@ -62,14 +58,14 @@ pub(super) struct Row {
     pub bins: Vec<Bin>,
 }
 
-/// What is reported.
-#[derive(Debug, Serialize)]
+/// What is reported with a probability of at least [`REPORTED`].
+#[derive(Debug, PartialEq, Serialize)]
 pub(super) struct Fractions {
-    /// As [`Row::kept`].
+    /// Fraction of the right poses that is reported.
     pub kept: f64,
-    /// As [`Row::precision`].
+    /// Fraction of right poses among those reported.
     pub precision: f64,
-    /// As [`Row::accepted`].
+    /// Fraction of absent objects that are reported.
     pub accepted: f64,
 }
 
@@ -106,7 +102,6 @@ fn row(given: Given, searches: &[Search]) -> Option<Row> {
     };
     let count = |poses: &[(bool, f64, bool)]| poses.iter().filter(|(_, _, right)| *right).count();
     let right = count(&best);
-    let Fractions { kept, precision, accepted } = fractions(&best, right);
     let with_others = |s: &Search| s.together.map(|t| (s.present, t.probability, t.right));
     let together: Vec<(bool, f64, bool)> = of.iter().filter_map(|s| with_others(s)).collect();
     let left: Vec<(bool, f64, bool)> =
@@ -120,10 +115,8 @@ fn row(given: Given, searches: &[Search]) -> Option<Row> {
         given,
         present,
         found: fraction(right, present),
-        kept,
-        precision,
         absent,
-        accepted,
+        single: fractions(&best, right),
         together: fractions(&together, count(&together)),
         at_once: fractions(&left, count(&together)),
         expected_error: error(&bins),
@@ -188,10 +181,10 @@ pub(super) fn markdown(whole: &Whole) -> String {
             r.given.name(),
             r.present,
             r.found,
-            r.kept,
-            r.precision,
+            r.single.kept,
+            r.single.precision,
             r.absent,
-            r.accepted,
+            r.single.accepted,
             r.at_once.kept,
             r.at_once.precision,
             r.at_once.accepted,
@@ -238,30 +231,22 @@ mod tests {
         let whole = Whole::of(&searches);
         let r = &whole.rows[0];
         assert_eq!((whole.rows.len(), r.present, r.absent), (1, 5, 2));
-        assert_eq!((r.found, r.kept, r.accepted), (0.6, 2.0 / 3.0, 0.5));
-        assert_eq!(r.precision, 0.5);
-        assert_eq!((r.at_once.kept, r.at_once.precision, r.at_once.accepted), (2.0 / 3.0, 0.5, 0.5));
+        let of = |kept, precision, accepted| Fractions { kept, precision, accepted };
+        assert_eq!(r.found, 0.6);
+        assert_eq!((&r.single, &r.at_once), (&of(2.0 / 3.0, 0.5, 0.5), &of(2.0 / 3.0, 0.5, 0.5)));
         // The absent object's pose has the pixels of a more probable one, and so has a right one.
         [0, 4].into_iter().for_each(|k| searches[k].overruled = true);
         let again = &Whole::of(&searches).rows[0];
-        assert_eq!(
-            (again.kept, again.accepted, again.expected_error),
-            (r.kept, r.accepted, r.expected_error)
-        );
-        assert_eq!(
-            (again.at_once.kept, again.at_once.precision, again.at_once.accepted),
-            (1.0 / 3.0, 0.5, 0.0)
-        );
-        assert_eq!((again.together.kept, again.together.accepted), (r.kept, r.accepted));
+        assert_eq!((&again.single, again.expected_error), (&r.single, r.expected_error));
+        assert_eq!((&again.at_once, &again.together), (&of(1.0 / 3.0, 0.5, 0.0), &r.single));
         // With its alternatives the right pose of 0.35 is reported, and so is the absent object's pose; the wrong one of 0.65 has a right
         // alternative.
         searches[2].together = Some(Together { probability: 0.55, right: true });
         searches[5].together = Some(Together { probability: 0.5, right: false });
         searches[3].together = Some(Together { probability: 0.65, right: true });
         let all = &Whole::of(&searches).rows[0];
-        assert_eq!((all.kept, all.precision, all.accepted), (r.kept, r.precision, r.accepted));
-        assert_eq!((all.together.kept, all.together.precision, all.together.accepted), (1.0, 4.0 / 6.0, 1.0));
-        assert_eq!((all.at_once.kept, all.at_once.precision, all.at_once.accepted), (0.75, 0.75, 0.5));
+        assert_eq!((&all.single, &all.together), (&r.single, &of(1.0, 4.0 / 6.0, 1.0)));
+        assert_eq!(all.at_once, of(0.75, 0.75, 0.5));
         // .05 in the bins of two poses, .65 in two of one, .75, .05 in one of one each.
         let expected = (2.0 * 0.05 + 0.65 + 0.65 + 0.75 + 0.05) / 6.0;
         assert!((r.expected_error - expected).abs() < 1e-9, "{}", r.expected_error);

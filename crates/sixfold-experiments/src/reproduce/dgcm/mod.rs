@@ -165,7 +165,7 @@ impl Context {
         let handled = a.out.join("handles").join("experience.db");
         learn::learn(&LearnArguments {
             families: vec!["mug".to_owned(), "drill".to_owned()],
-            members: if a.quick { 3 } else { 12 },
+            members: if a.quick { 1 } else { 12 },
             // The question is where the grasp is, not whether this hand could lift the object with it: the easy setting gives
             // more experience.
             hard: false,
