@@ -46,7 +46,10 @@ impl ImageRun<'_> {
 
     /// The results in the form of a report for programs and people.
     pub fn report(&self, found: &[FoundObject]) -> ImageReport {
-        let poses = found.iter().flat_map(|f| f.estimates.iter().map(|e| FoundPose::new(f, e))).collect();
+        let of = |f: &FoundObject| {
+            f.estimates.iter().map(|e| FoundPose::new(f.object.name(), f.seconds, e)).collect::<Vec<_>>()
+        };
+        let poses = found.iter().flat_map(of).collect();
         let missing = found.iter().filter(|f| f.estimates.is_empty());
         let not_found = missing.map(|f| f.object.name().to_owned()).collect();
         ImageReport { poses, not_found, overlay: None, diagnostics: BTreeMap::new() }
@@ -109,13 +112,14 @@ pub struct FoundPose {
 }
 
 impl FoundPose {
-    fn new(found: &FoundObject, estimate: &PoseEstimate) -> FoundPose {
+    /// `seconds` are those of the whole search for the object.
+    pub(crate) fn new(object: &str, seconds: f64, estimate: &PoseEstimate) -> FoundPose {
         let mut details = estimate.details.clone();
         if !details.contains_key("seconds") {
-            details.insert("seconds".to_owned(), found.seconds.into());
+            details.insert("seconds".to_owned(), seconds.into());
         }
         FoundPose {
-            object: found.object.name().to_owned(),
+            object: object.to_owned(),
             camera_from_object: estimate.camera_from_object.rows(),
             confidence: estimate.confidence,
             alternatives: estimate.weighted_alternatives(),
@@ -123,7 +127,7 @@ impl FoundPose {
             probability_with_alternatives: estimate.probability_with_alternatives(),
             verification: estimate.verification,
             details,
-            elapsed: found.seconds,
+            elapsed: seconds,
         }
     }
 

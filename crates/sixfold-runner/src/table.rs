@@ -46,20 +46,6 @@ mod tests {
     use super::*;
     use crate::image::FoundPose;
 
-    fn found(object: &str, estimate: &PoseEstimate) -> FoundPose {
-        FoundPose {
-            object: object.to_owned(),
-            camera_from_object: estimate.camera_from_object.rows(),
-            confidence: estimate.confidence,
-            probability: estimate.probability,
-            probability_with_alternatives: estimate.probability_with_alternatives(),
-            verification: None,
-            alternatives: estimate.weighted_alternatives(),
-            details: serde_json::Map::new(),
-            elapsed: 1.5,
-        }
-    }
-
     fn table(poses: Vec<FoundPose>) -> Vec<String> {
         let report =
             ImageReport { poses, not_found: vec!["cup".to_owned()], overlay: None, diagnostics: [].into() };
@@ -73,7 +59,8 @@ mod tests {
             ..PoseEstimate::new(Pose::from_translation(Vec3::new(x, 0.0, 0.75)), probability)
         };
         let mug = PoseEstimate { alternatives: vec![at(0.1, 0.25), at(0.2, 0.125)], ..at(0.0, 0.375) };
-        let lines = table(vec![found("mug", &mug), found("can", &at(-0.25, 0.875))]);
+        let lines =
+            table(vec![FoundPose::new("mug", 1.5, &mug), FoundPose::new("can", 1.5, &at(-0.25, 0.875))]);
         assert_eq!(lines.len(), 5, "{lines:?}");
         assert!(lines[0].contains("probability") && !lines[0].contains("confidence"), "{}", lines[0]);
         assert!(lines[1].starts_with("mug") && lines[1].contains(" 0.375 "), "{}", lines[1]);
@@ -82,7 +69,7 @@ mod tests {
         assert_eq!(lines[4], format!("{:<24} not found", "cup"));
         // A method without probabilities shows its confidence.
         let plain = PoseEstimate::new(Pose::identity(), 0.625);
-        let lines = table(vec![found("can", &plain)]);
+        let lines = table(vec![FoundPose::new("can", 1.5, &plain)]);
         assert!(lines[0].contains("confidence") && lines[1].contains(" 0.625 "), "{lines:?}");
     }
 }

@@ -302,7 +302,7 @@ mod tests {
         assert!(best.rotation_angle_to(&truth) < 0.01, "{}", best.rotation_angle_to(&truth));
         // Precise, as what is drawn on the box is aligned.
         assert!(best.distance_to(&truth) < 0.001, "{}", best.distance_to(&truth));
-        // Without anything drawn on the object what differs is not looked at, and the similarity hardly differs.
+        // For an object without a print the similarity decides, and it hardly differs.
         let plain = Hypothesis { drawn: 0.0, ..found[0] };
         let settled = views.settled(plain, None, &image, &camera).unwrap();
         assert_eq!(settled.pose, plain);

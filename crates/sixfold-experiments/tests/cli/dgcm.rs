@@ -28,16 +28,15 @@ fn the_tables_of_chapter_6_are_made_and_kept() {
     let curves = json["curves"].as_array().unwrap();
     assert_eq!(curves.len(), 8, "{curves:?}");
     assert!(curves.iter().all(|c| c["asked"].as_u64().unwrap() > 0), "{curves:?}");
-    assert!(curves.iter().all(|c| c["within"] == serde_json::json!([1.0, 1.0])), "{curves:?}");
-    let pair = serde_json::json!([{"from": "part.ply", "to": "part.ply", "within": [1.0, 1.0]}]);
-    assert_eq!(json["pairs"], pair);
+    let near = serde_json::json!([1.0, 1.0]);
+    assert!(curves.iter().all(|c| c["within"] == near), "{curves:?}");
+    assert_eq!(json["pairs"], serde_json::json!([{"from": "part.ply", "to": "part.ply", "within": near}]));
     // The same by the network alone, with the gripper where it is free and as published.
     for form in ["curves_network", "curves_published"] {
         let curves = json[form].as_array().unwrap();
         assert_eq!(curves.len(), 8, "{curves:?}");
         // Hypotheses of the network alone: near enough with eight experiences.
-        let most: Vec<_> = curves.iter().filter(|c| c["count"] == 8).collect();
-        assert!(most.iter().all(|c| c["within"] == serde_json::json!([1.0, 1.0])), "{form}: {curves:?}");
+        assert!(curves.iter().all(|c| c["count"] != 8 || c["within"] == near), "{form}: {curves:?}");
     }
     // Figure 6.13: grasps are on the handle, as experience is of handles only.
     let handles = json["handles"].as_array().unwrap();
