@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use sixfold_io::write_rgb;
 use sixfold_nn::choice::Choice;
 use sixfold_nn::device;
 use sixfold_nn::fingerprint::Fingerprint;
@@ -222,7 +223,13 @@ impl Recipe for DgcmRecipe {
         session: &mut Session<'_>,
     ) -> Result<Option<Pool>, TrainError> {
         session.note(&format!("making {} views", self.views));
-        Ok(Pool::new(pool, &session.progress(TrainingEvent::Preparing)))
+        let views = Pool::new(pool, &session.progress(TrainingEvent::Preparing));
+        if let Some(views) = &views {
+            let options = self.options();
+            let pairs = views.preview(&options.samples, options.common.seed);
+            write_rgb(&session.folder().join("preview.png"), &pairs).map_err(TrainError::method)?;
+        }
+        Ok(views)
     }
 
     /// Measures the coordinates of objects that were not used in the training.

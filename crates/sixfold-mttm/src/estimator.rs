@@ -1,5 +1,6 @@
 //! Template matching as a [`PoseEstimator`].
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use serde_json::{Map, Value, json};
@@ -34,6 +35,9 @@ pub struct MttmEstimator {
     /// From which sides an object with a mesh is searched, whatever templates its folder has; these templates are kept in files of
     /// their own. `None`: the templates in its folder, or those rendered with the field `templates`.
     pub coverage: Option<ViewCoverage>,
+    /// Templates by object id that are used instead of all others, such as those from a dataset's own depth images; then an object
+    /// that has none here is refused. Empty: not used.
+    pub given: Arc<BTreeMap<u32, ObjectTemplates>>,
     /// The network (feature `network`); without one, matching is by points alone.
     #[cfg(feature = "network")]
     pub network: Option<Arc<crate::model::MttmModel>>,
@@ -77,6 +81,17 @@ impl MttmEstimator {
             None => format!("{what}.bin"),
             Some(coverage) => format!("{what}-{}.bin", coverage.name()),
         }
+    }
+
+    /// The object's templates of [`MttmEstimator::given`].
+    fn given(&self, object: &Object) -> Result<ObjectTemplates, EstimatorError> {
+        let given = object.id.and_then(|id| self.given.get(&id));
+        given.cloned().ok_or_else(|| EstimatorError::Lacks {
+            object: object.name.clone(),
+            what: "template among those given",
+            method: METHOD,
+            advice: "give templates of this object too, or do not look for it",
+        })
     }
 
     /// The object's templates: those in its folder, or rendered from its mesh with [`MttmEstimator::templates`] and
@@ -140,7 +155,12 @@ impl PoseEstimator for MttmEstimator {
 
     fn prepare(&self, object: &Object) -> Result<Box<dyn PreparedObject>, EstimatorError> {
         let mut notes = vec![];
-        let templates = self.templates(object, &mut notes)?;
+        let (templates, described) = if self.given.is_empty() {
+            (self.templates(object, &mut notes)?, object.clone())
+        } else {
+            // Descriptors in the object's folder are those of its own templates.
+            (self.given(object)?, Object { folder: None, ..object.clone() })
+        };
         let mut rendered = None;
         if let Some(mesh) = object.mesh.as_ref().filter(|_| !self.templates_only) {
             let kept = VerificationMesh::cached(object.file(MESH_FILE).as_deref(), mesh);
@@ -151,7 +171,7 @@ impl PoseEstimator for MttmEstimator {
             );
             rendered = Some(kept.mesh);
         }
-        let known = self.described(KnownObject::new(templates, rendered), object, &mut notes);
+        let known = self.described(KnownObject::new(templates, rendered), &described, &mut notes);
         Ok(Box::new(MttmObject {
             name: object.name.clone(),
             mesh: object.mesh.clone(),

@@ -39,6 +39,13 @@ pub struct DepthView<'a> {
     pub camera_from_object: Option<Pose>,
 }
 
+impl DepthView<'_> {
+    /// Whether the mask shows enough depth for a template.
+    pub fn shows_enough(&self) -> bool {
+        !matches!(masked_points(self), Err(TemplateError::TooLittleDepth { .. }))
+    }
+}
+
 impl ObjectTemplates {
     /// Cuts the templates of an object out of depth images.
     ///

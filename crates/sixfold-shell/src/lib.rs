@@ -20,6 +20,7 @@ pub mod found;
 pub mod frames;
 pub mod grasp;
 pub mod idle;
+pub mod image_templates;
 mod labels;
 pub mod meshes;
 #[cfg(feature = "networks")]

@@ -4,7 +4,7 @@
 use std::path::Path;
 
 use serde_json::{Value, json};
-use sixfold_bop::{BopDataset, read_results};
+use sixfold_bop::{BopDataset, Estimate, read_results};
 use sixfold_geometry::{Image, Pose};
 use sixfold_io::{read_depth, write_rgb};
 use sixfold_mesh::{Mesh, ModelInfo, ModelsInfo, PlyFormat, Unit, read_mesh, write_ply};
@@ -91,6 +91,68 @@ fn tless_with_either_kind_of_models() {
     drop(run);
     let copied = std::fs::read(dir.join("simulated/models/obj_000001.ply")).unwrap();
     assert!(copied == std::fs::read(tiny.file("models_reconst/obj_000001.ply")).unwrap());
+}
+
+/// The split of T-LESS's training images, with the test images and their annotations.
+fn write_training_images(tiny: &Tiny) {
+    let (from, to) = (tiny.file("test_primesense/000007"), tiny.file("train_primesense/000007"));
+    std::fs::create_dir_all(to.join("depth")).unwrap();
+    for folder in ["", "depth"] {
+        for entry in std::fs::read_dir(from.join(folder)).unwrap().map(Result::unwrap) {
+            if entry.path().is_file() {
+                std::fs::copy(entry.path(), to.join(folder).join(entry.file_name())).unwrap();
+            }
+        }
+    }
+}
+
+/// Figures 5.7 to 5.9: templates from training images instead of rendered ones.
+#[test]
+fn templates_are_taken_from_the_depth_images_of_another_split() {
+    let tiny = tless();
+    let dir = tiny.path();
+    write_training_images(&tiny);
+    let estimate =
+        format!("estimate --method mttm --matcher points {TLESS} --models models_cad --targets all");
+    let images = format!("{estimate} --template-images train_primesense --templates-only");
+    sixfold(dir, &format!("{images} --out images.csv")).expect(0);
+    assert_found(&tiny.path().join("tiny"), "test_primesense", &dir.join("images.csv"));
+    let rendered = format!("{estimate} --templates-only --ids 1 --out rendered.csv");
+    sixfold(dir, &rendered).expect(0);
+    let of_image = read_results(&dir.join("images.csv")).unwrap();
+    let of_mesh = read_results(&dir.join("rendered.csv")).unwrap();
+    let first = |all: &[Estimate]| all.iter().find(|e| e.obj_id == 1).unwrap().camera_from_object;
+    assert_ne!(first(&of_image).to_matrix(), first(&of_mesh).to_matrix());
+    // The poses are those of the images' annotations: rotated ones there give rotated poses here.
+    let rotated = Pose::exp(&[0.0, 0.0, 0.0, 0.0, 0.0, 0.2].into());
+    let truth = tiny.file("train_primesense/000007/scene_gt.json");
+    let mut annotated: Value = serde_json::from_slice(&std::fs::read(&truth).unwrap()).unwrap();
+    for (im_id, _) in &tiny.truth {
+        let pose = tiny.truth_of(*im_id, 1) * rotated;
+        let matrix = pose.to_matrix();
+        let rows: Vec<f64> = (0..9).map(|k| matrix[(k / 3, k % 3)]).collect();
+        annotated[im_id.to_string()][0]["cam_R_m2c"] = rows.into();
+    }
+    std::fs::write(&truth, annotated.to_string()).unwrap();
+    sixfold(dir, &format!("{images} --ids 1 --out rotated.csv")).expect(0);
+    let found = read_results(&dir.join("rotated.csv")).unwrap();
+    assert_eq!(found.len(), 3);
+    for e in found {
+        assert_near(&e.camera_from_object, &(tiny.truth_of(e.im_id, 1) * rotated));
+    }
+    // Images that are searched themselves, or that show an object too little.
+    let same = format!("{estimate} --template-images test_primesense --out a.csv");
+    fails(dir, &same, &["--template-images test_primesense", "--template-frames"]);
+    fails(
+        dir,
+        &format!("{estimate} --template-images train --out a.csv"),
+        &["tiny/train", "split is missing"],
+    );
+    let frames = r#"[{"scene_id": 7, "im_id": 5}]"#;
+    std::fs::write(dir.join("frames.json"), frames).unwrap();
+    fails(dir, &format!("{images} --template-frames frames.json --out a.csv"), &["5", "000007"]);
+    std::fs::remove_file(tiny.file("train_primesense/000007/depth/000004.png")).unwrap();
+    fails(dir, &format!("{images} --out a.csv"), &["7/4", "no depth image", "simulate-depth"]);
 }
 
 #[cfg(feature = "networks")]

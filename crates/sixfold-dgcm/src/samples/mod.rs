@@ -2,6 +2,7 @@
 
 mod pairs;
 mod pool;
+mod preview;
 
 pub use pairs::{Pair, PairOptions};
 pub use pool::{GraspPoolOptions, Pool, View};

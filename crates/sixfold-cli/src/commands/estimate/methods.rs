@@ -9,6 +9,7 @@ use sixfold_align::DepthOptions;
 use sixfold_estimator::PoseEstimator;
 use sixfold_mttm::{MaskSource, MatchedBy, MttmEstimator, MttmOptions};
 use sixfold_ppf::PpfEstimator;
+use sixfold_shell::image_templates::ImageTemplateArguments;
 
 use super::arguments::CommonArguments;
 use super::networks;
@@ -130,6 +131,8 @@ struct MttmArguments {
     /// add`, else above)
     #[arg(long, value_enum, value_name = "VIEWS")]
     templates: Option<TemplateViews>,
+    #[command(flatten)]
+    images: ImageTemplateArguments,
     /// Verify poses with the templates, not with the mesh
     #[arg(long)]
     templates_only: bool,
@@ -154,6 +157,12 @@ impl MethodArguments for MttmArguments {
             options,
             coverage: self.templates.map(TemplateViews::coverage),
             templates_only: self.templates_only,
+            given: self.images.templates(
+                common.dataset.as_deref(),
+                &common.split,
+                common.models.as_deref(),
+                &common.ids,
+            )?,
             ..MttmEstimator::default()
         };
         Ok(Box::new(networks::with_network(estimator, self.weights.as_deref())?))

@@ -1,22 +1,25 @@
 //! Semantic grasps (figure 6.13): experience from handles only transfers the grasp to the handle of another
-//! object.
+//! object. Beside Sixfold's ranking: DGCM-Net as published, alone and joined with GPD, and three planners, which do not know
+//! handles.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, Result};
 use serde::{Deserialize, Serialize};
 use sixfold_dgcm::model::DgcmModel;
-use sixfold_dgcm::transfer::{Memory, ProposeOptions, propose, rank_on_part};
-use sixfold_geometry::Vec3;
+use sixfold_dgcm::transfer::{Memory, RankedGrasps, grasps_as_published, grasps_from_experience};
+use sixfold_geometry::{DepthImage, NormalOptions, Rect, RgbImage, Vec3, normals_from_depth};
 use sixfold_grasp::{
-    AntipodalOptions, ClusterOptions, DrawnGrasp, Grasp, GraspFitter, centre_between_pads, draw_grasps,
+    AntipodalOptions, DrawnGrasp, Grasp, GraspView, Gripper, centre_between_pads, draw_grasps,
 };
-use sixfold_io::write_rgb;
+use sixfold_io::{read_rgb, write_rgb};
 use sixfold_mesh::Mesh;
-use sixfold_simulation::{AttemptOptions, ConvexParts, PartsOptions, scene};
+use sixfold_plot::{Canvas, INK};
+use sixfold_simulation::{AttemptOptions, ConvexParts, PartsOptions, SimulatedView, scene};
 
 use sixfold_shell::grasp::journal::Journal;
 use sixfold_shell::grasp::object_list::{PartBox, file_name};
+use sixfold_shell::grasp::planner::Planner;
 use sixfold_shell::grasp::trial::Hardness;
 use sixfold_shell::overlay;
 use sixfold_shell::progress::{Progress, check_interrupt};
@@ -26,24 +29,50 @@ const MIN_SEEN: f64 = 0.02;
 /// Points within this distance of the named part's box count as on it, metres.
 const AROUND: f64 = 0.006;
 
-/// One view of an object with a handle.
+/// Width and height of an image of the figure, pixels.
+const SIDE: usize = 200;
+/// Height of the figure's captions, pixels.
+const CAPTION: usize = 24;
+/// Views of each object in the figure.
+const SHOWN: usize = 2;
+
+/// One view of an object with a handle. For each method: whether its first grasp is on the handle; `None` where nothing was
+/// proposed.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub(super) struct Row {
     pub object: String,
     pub number: u64,
     /// Fraction of the object's pixels that show the handle.
     pub seen: f64,
-    /// Whether the first grasp from experience on handles is on the handle; `None` where nothing was proposed.
+    /// Sixfold's ranking, with experience on handles.
     pub by_experience: Option<bool>,
-    /// The same for the planner's first grasp; the planner has no notion of handles.
+    /// DGCM-Net alone as published, with the same experience.
+    pub by_network: Option<bool>,
+    /// GPD's grasps joined with DGCM-Net as published.
+    pub by_gpd_and_network: Option<bool>,
+    /// The antipodal planner. It has no notion of handles, like the next two.
     pub by_geometry: Option<bool>,
+    pub by_gpd: Option<bool>,
+    pub by_haf: Option<bool>,
 }
+
+/// The methods' names and answers, in the order of the figure's columns.
+pub(super) const METHODS: [(&str, fn(&Row) -> Option<bool>); 6] = [
+    ("experience", |r| r.by_experience),
+    ("network", |r| r.by_network),
+    ("gpd and network", |r| r.by_gpd_and_network),
+    ("geometry", |r| r.by_geometry),
+    ("gpd", |r| r.by_gpd),
+    ("haf", |r| r.by_haf),
+];
 
 /// The inputs of the test.
 pub(super) struct Handles<'a> {
     pub objects: &'a [(String, String, Mesh)],
     pub parts: &'a [Option<PartBox>],
     pub network: &'a DgcmModel,
+    /// GPD and HAF.
+    pub planners: &'a [Planner; 2],
     pub setting: &'a Hardness,
     /// Views of each object.
     pub views: usize,
@@ -62,6 +91,7 @@ impl Handles<'_> {
         let recorded = serde_json::json!({
             "objects": marked.iter().map(|m| m.0).collect::<Vec<_>>(), "views": self.views, "seed": self.seed,
             "network": self.network.fingerprint(), "experiences": memory.len(),
+            "planners": self.planners.each_ref().map(Planner::fingerprint),
         });
         let (mut journal, mut rows) = Journal::open::<Row>(&folder.join("handles.jsonl"), &recorded)?;
         let mut progress = Progress::new("views of handles", marked.len() * self.views);
@@ -84,6 +114,7 @@ impl Handles<'_> {
             }
         }
         progress.finish();
+        figure(&rows, folder)?;
         Ok(rows)
     }
 
@@ -110,38 +141,123 @@ impl Handles<'_> {
             return Ok(None);
         }
         let planner = AntipodalOptions { seed: scene.noise, ..options.planner };
-        let fitter = GraspFitter::new(view, gripper, &planner)?;
-        let options = ProposeOptions { part: Some(part.name.clone()), ..ProposeOptions::default() };
-        let found = propose(&fitter, self.network, memory, &options)?;
-        let outcomes = memory.outcomes(&gripper.name);
-        let clusters = ClusterOptions::default();
-        let geometry = sixfold_grasp::antipodal_grasps(view, gripper, &planner)?;
-        let first = rank_on_part(&geometry, &found, &clusters, &fitter, &outcomes);
-        let plain = sixfold_grasp::cluster_grasps(&geometry, &clusters);
-        let holds = |g: &Grasp| on(&centre_between_pads(&g.camera_from_gripper));
+        let grasps = self.first_grasps(view, &planner, memory, &part.name)?;
+        let held = grasps.map(|g| g.map(|g| on(&centre_between_pads(&g.camera_from_gripper))));
+        let [by_experience, by_network, by_gpd_and_network, by_geometry, by_gpd, by_haf] = held;
         let row = Row {
             object: name.to_owned(),
             number,
             seen,
-            by_experience: first.first().map(|r| holds(&r.grasp)),
-            by_geometry: plain.first().map(|c| holds(&c.best)),
+            by_experience,
+            by_network,
+            by_gpd_and_network,
+            by_geometry,
+            by_gpd,
+            by_haf,
         };
-        let drawn = |g: &Grasp, color| DrawnGrasp {
-            camera_from_gripper: g.camera_from_gripper,
-            opening: g.opening,
-            color,
-        };
-        let mut grasps = vec![];
-        if let Some(c) = plain.first() {
-            grasps.push(drawn(&c.best, [150, 150, 150]));
-        }
-        if let Some(r) = first.first() {
-            let color = if row.by_experience == Some(true) { [60, 220, 80] } else { [235, 70, 60] };
-            grasps.push(drawn(&r.grasp, color));
-        }
-        let background = overlay::depth_picture(&picture.depth);
-        let image = draw_grasps(&background, Some(&picture.depth), &picture.camera, gripper, &grasps)?;
-        write_rgb(&folder.join(format!("{}-{number}.png", file_name(name))), &image)?;
+        write_rgb(&strip_file(&row, folder), &strip(picture, view, gripper, &grasps, &held)?)?;
         Ok(Some(row))
     }
+
+    /// The first grasp of each method, in the order of [`METHODS`].
+    fn first_grasps(
+        &self,
+        view: &GraspView,
+        options: &AntipodalOptions,
+        memory: &mut Memory,
+        part: &str,
+    ) -> Result<[Option<Grasp>; METHODS.len()]> {
+        let gripper = &self.setting.gripper;
+        let first = |found: RankedGrasps| found.ranked.first().map(|r| r.grasp);
+        let [gpd, haf] = self.planners;
+        let of_gpd = gpd.grasps(view, gripper, options)?;
+        let ours = grasps_from_experience(view, gripper, options, self.network, memory, Some(part))?;
+        let mut published =
+            |planned| grasps_as_published(view, gripper, options, self.network, memory, Some(part), planned);
+        let alone = published(None)?;
+        let joined = published(Some(of_gpd.as_slice()))?;
+        let antipodal = Planner::Antipodal;
+        let of_antipodal = antipodal.grasps(view, gripper, options)?;
+        let of_haf = haf.grasps(view, gripper, options)?;
+        let planned = |planner: &Planner, grasps: &[_]| planner.ranked(grasps).first().map(|c| c.best);
+        Ok([
+            first(ours),
+            first(alone),
+            first(joined),
+            planned(&antipodal, &of_antipodal),
+            planned(gpd, &of_gpd),
+            planned(haf, &of_haf),
+        ])
+    }
+}
+
+/// The image of a row's view.
+fn strip_file(row: &Row, folder: &Path) -> PathBuf {
+    folder.join(format!("{}-{}.png", file_name(&row.object), row.number))
+}
+
+/// The object's normals, and the gripper of each method on its depth: green on the handle, red elsewhere.
+fn strip(
+    picture: &SimulatedView,
+    view: &GraspView,
+    gripper: &Gripper,
+    grasps: &[Option<Grasp>],
+    held: &[Option<bool>],
+) -> Result<RgbImage> {
+    let [left, top, width, height] = view.mask.bounding_box().unwrap_or([0, 0, SIDE, SIDE]);
+    let size = (1.7 * width.max(height) as f64).round().max(1.0);
+    let corner = |from: usize, length: usize| (from as f64 + 0.5 * (length as f64 - size)).round();
+    let (x, y) = (corner(left, width), corner(top, height));
+    let camera = picture.camera.crop(&Rect { x, y, width: size, height: size }).resize(SIDE, SIDE);
+    let step = size / SIDE as f64;
+    let source = |u: usize, v: usize| {
+        let at = |corner: f64, i: usize| (corner + (i as f64 + 0.5) * step).floor();
+        let (x, y) = (at(x, u), at(y, v));
+        (x >= 0.0 && y >= 0.0).then_some((x as usize, y as usize))
+    };
+    let normals = overlay::normal_picture(&normals_from_depth(
+        &picture.depth,
+        &picture.camera,
+        &NormalOptions::default(),
+    ));
+    let normals = RgbImage::from_fn(SIDE, SIDE, |u, v| {
+        source(u, v).and_then(|(x, y)| normals.get(x, y).copied()).unwrap_or([0; 3])
+    });
+    let depth = DepthImage::from_fn(SIDE, SIDE, |u, v| {
+        source(u, v).and_then(|(x, y)| picture.depth.get(x, y).copied()).unwrap_or(0.0)
+    });
+    let background = overlay::depth_picture(&depth);
+    let mut images = vec![normals];
+    for (grasp, held) in grasps.iter().zip(held) {
+        let color = if *held == Some(true) { [60, 220, 80] } else { [235, 70, 60] };
+        let drawn: Vec<DrawnGrasp> = grasp
+            .iter()
+            .map(|g| DrawnGrasp { camera_from_gripper: g.camera_from_gripper, opening: g.opening, color })
+            .collect();
+        images.push(draw_grasps(&background, Some(&depth), &camera, gripper, &drawn)?);
+    }
+    Ok(RgbImage::from_fn(SIDE * images.len(), SIDE, |x, y| images[x / SIDE][(x % SIDE, y)]))
+}
+
+/// Figure 6.13, `handles.png`: the first views of each object, one below the other.
+fn figure(rows: &[Row], folder: &Path) -> Result<()> {
+    let mut strips = vec![];
+    for (k, row) in rows.iter().enumerate() {
+        if rows[..k].iter().filter(|r| r.object == row.object).count() < SHOWN {
+            strips.push(read_rgb(&strip_file(row, folder))?);
+        }
+    }
+    let width = SIDE * (1 + METHODS.len());
+    let mut head = Canvas::new(width, CAPTION);
+    let names = std::iter::once("normals").chain(METHODS.map(|m| m.0));
+    for (k, name) in names.enumerate() {
+        head.text((SIDE * k) as f64 + 6.0, 6.0, 1.5, name, INK);
+    }
+    let head = head.finish();
+    let image =
+        RgbImage::from_fn(width, CAPTION + SIDE * strips.len(), |x, y| match y.checked_sub(CAPTION) {
+            None => head[(x, y)],
+            Some(y) => strips[y / SIDE].get(x, y % SIDE).copied().unwrap_or([255; 3]),
+        });
+    Ok(write_rgb(&folder.join("handles.png"), &image)?)
 }

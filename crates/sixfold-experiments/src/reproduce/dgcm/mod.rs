@@ -24,6 +24,7 @@ use sixfold_shell::Outcome;
 use sixfold_shell::grasp::experience::{NetworkArguments, OutboxArguments, memory, model};
 use sixfold_shell::grasp::learn::{self, Curve, LearnArguments};
 use sixfold_shell::grasp::object_list::{Named, ObjectsArguments, PartBox, file_name, objects_with_parts};
+use sixfold_shell::grasp::planner::Planner;
 use sixfold_shell::grasp::trial::{Hardness, PhysicsArguments, hardness};
 use sixfold_shell::output::JsonArguments;
 
@@ -176,7 +177,8 @@ impl Context {
         })?;
         let Context { setting, network, objects, parts, .. } = self;
         let views = if a.quick { 2 } else { 10 };
-        let handles = Handles { objects, parts, network, setting, views, seed: a.seed };
+        let planners = &[Planner::gpd(None)?, Planner::haf(None)?];
+        let handles = Handles { objects, parts, network, planners, setting, views, seed: a.seed };
         handles.run(&mut memory(&StorePlace::File(handled), network)?, &a.out.join("handles"))
     }
 
@@ -580,7 +582,9 @@ fn learning_markdown(incremental: &[FromNothing]) -> String {
 /// The table of figure 6.13.
 fn handles_markdown(rows: &[handles::Row]) -> String {
     let mut out = String::new();
-    out += "\nFirst grasp on the handle (figure 6.13), views that show it\n\n| object | views | by experience on handles | by geometry alone |\n|---|---|---|---|\n";
+    out += "\nFirst grasp on the handle (figure 6.13), number of views that show it: with experience on handles, ours, as published alone and joined with GPD; by planners\n\n";
+    let heads = handles::METHODS.map(|m| m.0).join(" | ");
+    let _ = writeln!(out, "| object | views | {heads} |\n|---|---|{}", "---|".repeat(handles::METHODS.len()));
     let mut names: Vec<&String> = vec![];
     for row in rows {
         if !names.contains(&&row.object) {
@@ -589,15 +593,9 @@ fn handles_markdown(rows: &[handles::Row]) -> String {
     }
     for name in names {
         let rows: Vec<_> = rows.iter().filter(|r| r.object == *name).collect();
-        let count =
-            |f: &dyn Fn(&handles::Row) -> Option<bool>| rows.iter().filter(|r| f(r) == Some(true)).count();
-        let _ = writeln!(
-            out,
-            "| {name} | {} | {} | {} |",
-            rows.len(),
-            count(&|r| r.by_experience),
-            count(&|r| r.by_geometry)
-        );
+        let counts = handles::METHODS
+            .map(|(_, on_handle)| rows.iter().filter(|r| on_handle(r) == Some(true)).count().to_string());
+        let _ = writeln!(out, "| {name} | {} | {} |", rows.len(), counts.join(" | "));
     }
     out
 }
