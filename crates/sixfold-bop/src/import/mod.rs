@@ -9,6 +9,7 @@ mod nol;
 mod numpy;
 mod pickle;
 mod smot;
+mod view_range;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -28,9 +29,10 @@ use crate::write::{NewImage, SceneWriter, write_camera};
 pub use ho3d::{Ho3dOptions, import_ho3d};
 pub use nol::{NolOptions, import_nol};
 pub use smot::{SmotOptions, import_smot};
+pub use view_range::ViewRange;
 
 /// Summary of a conversion.
-#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize)]
 pub struct ImportSummary {
     /// Scenes, one for each sequence.
     pub scenes: usize,
@@ -38,6 +40,8 @@ pub struct ImportSummary {
     pub images: usize,
     /// Ids of the objects.
     pub objects: BTreeSet<u32>,
+    /// From which sides the images show each object.
+    pub views: BTreeMap<u32, ViewRange>,
     /// Images that were left out because they have no annotated pose.
     pub without_poses: usize,
 }
@@ -78,6 +82,8 @@ struct Importer {
     names: BTreeMap<String, String>,
     /// Cameras of all sizes there are, by size.
     cameras: BTreeMap<(usize, usize), Camera>,
+    /// The poses of each object, camera_from_object.
+    poses: BTreeMap<u32, Vec<Pose>>,
     summary: ImportSummary,
 }
 
@@ -92,6 +98,7 @@ impl Importer {
             infos: ModelsInfo::default(),
             names: BTreeMap::new(),
             cameras: BTreeMap::new(),
+            poses: BTreeMap::new(),
             summary: ImportSummary::default(),
         }
     }
@@ -180,6 +187,9 @@ impl Importer {
             ..NewImage::new(frame.im_id, frame.camera)
         })?;
         self.cameras.entry((frame.camera.width, frame.camera.height)).or_insert(*frame.camera);
+        for truth in frame.ground_truth {
+            self.poses.entry(truth.obj_id).or_default().push(truth.camera_from_object);
+        }
         self.summary.images += 1;
         Ok(())
     }
@@ -204,7 +214,8 @@ impl Importer {
                 write_camera(&self.out, camera, self.depth_scale)?;
             }
         }
-        Ok(self.summary)
+        let views = self.poses.iter().filter_map(|(id, poses)| Some((*id, ViewRange::of(poses)?))).collect();
+        Ok(ImportSummary { views, ..self.summary })
     }
 }
 

@@ -171,6 +171,13 @@ fn convert(
             summary.scenes,
             out.display()
         );
+        for (id, v) in &summary.views {
+            let [from, to, low, high] = [v.azimuth[0], v.azimuth[1], v.elevation[0], v.elevation[1]];
+            println!(
+                "object {id}: {} images, azimuth {from:.0} to {to:.0}, elevation {low:.1} to {high:.1} degrees",
+                v.images
+            );
+        }
         if summary.without_poses > 0 {
             println!("{} images left out: nothing is annotated there", summary.without_poses);
         }

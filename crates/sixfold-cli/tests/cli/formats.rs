@@ -217,6 +217,15 @@ fn smot_is_converted_searched_and_scored() {
     let import = "import smot SMOT --split test --out smot";
     let json = sixfold(dir, &format!("{import} --json")).expect(0).json();
     assert_eq!((&json["images"], &json["objects"]), (&3.into(), &json!([1, 2])));
+    // Table 4.2: the sides that the images show.
+    let elevations = tiny.truth.iter().map(|(im_id, _)| {
+        let camera = tiny.truth_of(*im_id, 2).inverse().translation();
+        (camera.z / camera.norm()).asin().to_degrees()
+    });
+    let lowest = elevations.fold(f64::INFINITY, f64::min);
+    let views = &json["views"]["2"];
+    assert_eq!(views["images"], 3);
+    assert!((views["elevation"][0].as_f64().unwrap() - lowest).abs() < 1e-6, "{views} {lowest}");
     sixfold(dir, &format!("{ESTIMATE} --dataset smot --out smot.csv")).expect(0);
     assert_found(&dir.join("smot"), "test", &dir.join("smot.csv"));
     for (im_id, here) in &tiny.truth {
