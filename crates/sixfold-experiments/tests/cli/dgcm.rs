@@ -1,7 +1,9 @@
 //! `sixfold reproduce dgcm`: all five parts, quickly, on one object that the test writes.
 
-use sixfold_geometry::Vec3;
 use sixfold_geometry::random::stream;
+use sixfold_geometry::{Pose, Vec3};
+use sixfold_grasp::gripper_pose;
+use sixfold_io::write_depth;
 use sixfold_mesh::{PlyFormat, Unit, write_ply};
 use sixfold_synth::shapes::{Family, member};
 
@@ -115,4 +117,67 @@ fn experience_on_handles_and_nothing_else_leads_to_the_handle() {
     };
     assert!(green(1) > 200 && [4, 5, 6].map(green) == [0; 3], "{:?}", [1, 4, 5, 6].map(green));
     assert!(dir.join("out/handles.json").is_file());
+}
+
+/// Figure 6.7 on recorded depth images with annotated grasps.
+#[test]
+fn transfer_is_measured_on_recorded_images() {
+    let case = OneImage::new();
+    let dir = case.path();
+    // On top of the part's tower, from above, closing across it.
+    let tip = Vec3::new(-0.04, -0.015, 0.09);
+    let grasp = gripper_pose(&tip, &-Vec3::z(), &Vec3::x()).unwrap();
+    let list = |name: &str, moved: f64| {
+        let image = |k: u32| {
+            let x = 0.02 * f64::from(k);
+            let pose = on_table(x - 0.03, 0.01, 0.2 * f64::from(k));
+            let depth = format!("{k}.png");
+            write_depth(&dir.join(&depth), &depth_of(&[(&part(), pose)]), DEPTH_SCALE).unwrap();
+            let along = Pose::from_translation(Vec3::new(moved * f64::from(k), 0.0, 0.0));
+            let matrix = (pose * along * grasp).to_matrix();
+            let rows: Vec<Vec<f64>> = (0..4).map(|i| (0..4).map(|j| matrix[(i, j)]).collect()).collect();
+            serde_json::json!({
+                "class": "part", "object": "part", "depth": depth, "camera": "camera.json",
+                "camera_from_gripper": rows, "width": 0.04,
+            })
+        };
+        let images: Vec<serde_json::Value> = (0..4).map(image).collect();
+        std::fs::write(dir.join(name), serde_json::to_string(&images).unwrap()).unwrap();
+    };
+    list("views.json", 0.0);
+    list("moved.json", 0.1);
+    let measure = |list: &str| {
+        format!(
+            "reproduce dgcm --recorded {list} --weights {NETWORK} --quick --figure 6.7 --out {list}-out --json"
+        )
+    };
+    let within = |list: &str| {
+        let json = sixfold(dir, &measure(list)).expect(0).json();
+        // Two of the four images are experience, two are tested.
+        let curves = json["curves"].as_array().unwrap().clone();
+        assert!(curves.len() == 8 && curves.iter().all(|c| c["asked"] == 2), "{curves:?}");
+        curves.iter().map(|c| c["within"][0].as_f64().unwrap()).collect::<Vec<_>>()
+    };
+    assert_eq!(within("views.json"), [1.0; 8]);
+    // Grasps that are annotated elsewhere in each image: what is transferred is not what is wanted.
+    assert_eq!(within("moved.json"), [0.0; 8]);
+    assert!(dir.join("views.json-out/experience-5cm.png").is_file());
+    // Resumed with another list.
+    std::fs::copy(dir.join("moved.json"), dir.join("views.json")).unwrap();
+    fails(dir, &measure("views.json"), &["answers.jsonl", "other options"]);
+    for (from, to, words) in [
+        ("\"width\":0.04", "\"width\":0.4", ["image 1", "width: found 0.4 m", "jaws-140"]),
+        ("\"depth\":\"2.png\"", "\"depth\":\"9.png\"", ["image 3", "9.png", "No such file"]),
+        ("\"class\"", "\"klass\"", ["bad.json", "klass", "expected"]),
+    ] {
+        let good = std::fs::read_to_string(dir.join("moved.json")).unwrap();
+        std::fs::write(dir.join("bad.json"), good.replace(from, to)).unwrap();
+        fails(dir, &measure("bad.json"), &words);
+    }
+    let one = std::fs::read_to_string(dir.join("moved.json")).unwrap();
+    let one: Vec<serde_json::Value> = serde_json::from_str(&one).unwrap();
+    std::fs::write(dir.join("bad.json"), serde_json::to_string(&one[..1]).unwrap()).unwrap();
+    fails(dir, &measure("bad.json"), &["1 image of object part", "at least 2"]);
+    let other = measure("moved.json").replace("--figure 6.7", "--figure 6.13");
+    fails(dir, &other, &["--recorded", "found --figure 6.13"]);
 }

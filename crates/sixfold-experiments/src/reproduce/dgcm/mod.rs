@@ -3,6 +3,7 @@
 mod handles;
 mod offline;
 mod pictures;
+mod recorded;
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -44,8 +45,13 @@ const FROM_NOTHING: [&str; 3] = ["PowerDrill.ply", "MustardBottle.ply", "Banana.
 #[derive(Debug, Args)]
 pub(crate) struct ReproduceDgcmArguments {
     /// List of test objects, as benches/grasp-objects.json
-    #[arg(long, value_name = "FILE")]
-    pub list: PathBuf,
+    #[arg(long, value_name = "FILE", required_unless_present = "recorded")]
+    pub list: Option<PathBuf>,
+    /// Measure figure 6.7 on recorded depth images with annotated grasps instead of simulated ones: JSON, [{"class": "mug", "object":
+    /// "red mug", "depth": "1.png", "camera": "camera.json", "mask": "1-mask.png", "camera_from_gripper": [[...], ...], "width":
+    /// 0.04}, ...], files relative to it (docs/published.md)
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["list", "meshes"], requires = "figure")]
+    pub recorded: Option<PathBuf>,
     /// Folder that the list's meshes are in (default: the list's own)
     #[arg(long, value_name = "DIR")]
     pub meshes: Option<PathBuf>,
@@ -147,18 +153,26 @@ struct Context {
     objects: Named,
     parts: Vec<Option<PartBox>>,
     instances: Vec<Instance>,
+    /// A hash of the list of recorded views.
+    recorded: Option<u64>,
 }
 
 impl Context {
     fn of(a: &ReproduceDgcmArguments) -> Result<Context> {
         let setting = hardness(&physics(), true)?;
         let network = model(&a.network)?;
+        if let Some(list) = &a.recorded {
+            let (instances, hash) = recorded::instances(list, &setting.gripper)?;
+            let (objects, parts) = Default::default();
+            return Ok(Context { setting, network, objects, parts, instances, recorded: Some(hash) });
+        }
         let (objects, parts) = objects_with_parts(&a.objects())?;
         let instances = offline::instances(&objects, &setting.gripper);
         if instances.is_empty() {
-            bail!("{}: no object that {} could hold from above", a.list.display(), setting.gripper.name);
+            let list = a.list.as_deref().unwrap_or(Path::new("--list"));
+            bail!("{}: no object that {} could hold from above", list.display(), setting.gripper.name);
         }
-        Ok(Context { setting, network, objects, parts, instances })
+        Ok(Context { setting, network, objects, parts, instances, recorded: None })
     }
 
     /// Figure 6.13: grasps on handles.
@@ -194,6 +208,7 @@ impl Context {
         let answers = |form, folder| {
             Offline {
                 instances: &self.instances,
+                recorded: self.recorded,
                 network: &self.network,
                 gripper: &self.setting.gripper,
                 options: &self.setting.options,
@@ -221,6 +236,9 @@ impl Context {
 
 pub(crate) fn run(a: &ReproduceDgcmArguments, json: &JsonArguments) -> Result<Outcome> {
     if let Some(figure) = a.figure.as_deref() {
+        if a.recorded.is_some() && !figure.starts_with("6.7") {
+            bail!("--recorded: found --figure {figure}, expected 6.7, 6.7-network or 6.7-published");
+        }
         let context = Context::of(a)?;
         match figure {
             "6.10" => {
@@ -324,14 +342,15 @@ fn physics() -> PhysicsArguments {
 impl ReproduceDgcmArguments {
     fn objects(&self) -> ObjectsArguments {
         ObjectsArguments {
-            list: Some(self.list.clone()),
+            list: self.list.clone(),
             meshes: self.meshes.clone(),
             ..ObjectsArguments::default()
         }
     }
 
     fn path_of(&self, name: &str) -> String {
-        let folder = self.meshes.clone().or_else(|| self.list.parent().map(Path::to_path_buf));
+        let of_list = || self.list.as_deref().and_then(Path::parent).map(Path::to_path_buf);
+        let folder = self.meshes.clone().or_else(of_list);
         folder.unwrap_or_default().join(name).display().to_string()
     }
 
@@ -494,6 +513,9 @@ impl Transfer {
             mean_pair(true),
             mean_pair(false)
         );
+        if self.stretched.iter().all(|s| s.asked == 0) {
+            return;
+        }
         *out += "Experience of an object, grasp on the same one stretched along each axis\n\n| largest change of an axis | views | within |\n|---|---|---|\n";
         for s in &self.stretched {
             let _ = writeln!(

@@ -3,11 +3,12 @@
 //!
 //! As in section 6.3.1, the target grasp is from above, on the object's upright axis, and a rotation about the approach
 //! direction is ignored. There the poses were annotated by hand on depth images; here they follow from the meshes, and the
-//! depth images are simulated. The first grasp of the ranking by equation 6.6 is evaluated, whether it would hold or not.
+//! depth images are simulated, or both are recorded ([`super::recorded`]). The first grasp of the ranking by equation 6.6 is evaluated, whether it would hold or not.
 
 use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
+use std::sync::Arc;
 
 use anyhow::{Context, Result, bail};
 use rand::RngExt;
@@ -24,6 +25,7 @@ use sixfold_grasp::{
 use sixfold_mesh::Mesh;
 use sixfold_simulation::{AttemptOptions, ConvexParts, PartsOptions, scene};
 
+use super::recorded::CLEARANCE;
 use sixfold_shell::grasp::journal::Journal;
 use sixfold_shell::progress::{Progress, check_interrupt};
 
@@ -38,9 +40,15 @@ const ROOM: f64 = 0.01;
 pub(super) struct Instance {
     pub class: String,
     pub name: String,
-    mesh: Mesh,
-    /// The target grasp and its width in metres.
-    grasp: (Pose, f64),
+    pub shape: Shape,
+}
+
+/// Where an object's views come from.
+pub(super) enum Shape {
+    /// Simulated: its mesh, the target grasp, and the width there in metres.
+    Mesh(Mesh, (Pose, f64)),
+    /// Recorded views, each with the target grasp in the camera's frame.
+    Recorded(Vec<(Arc<GraspView>, Grasp)>),
 }
 
 /// The objects of a list that can be grasped from above, in its order.
@@ -49,7 +57,11 @@ pub(super) fn instances(objects: &[(String, String, Mesh)], gripper: &Gripper) -
         .iter()
         .filter_map(|(class, name, mesh)| {
             let grasp = from_above(mesh, gripper)?;
-            Some(Instance { class: class.clone(), name: name.clone(), mesh: mesh.clone(), grasp })
+            Some(Instance {
+                class: class.clone(),
+                name: name.clone(),
+                shape: Shape::Mesh(mesh.clone(), grasp),
+            })
         })
         .collect()
 }
@@ -80,7 +92,7 @@ fn from_above(mesh: &Mesh, gripper: &Gripper) -> Option<(Pose, f64)> {
 struct View {
     instance: usize,
     number: u64,
-    view: GraspView,
+    view: Arc<GraspView>,
     /// The target grasp in the camera's frame.
     wanted: Grasp,
 }
@@ -137,6 +149,8 @@ pub(super) enum Form {
 /// The inputs of the offline experiments.
 pub(super) struct Offline<'a> {
     pub instances: &'a [Instance],
+    /// A hash of the list of recorded views.
+    pub recorded: Option<u64>,
     pub network: &'a DgcmModel,
     pub gripper: &'a Gripper,
     pub options: &'a AttemptOptions,
@@ -148,10 +162,13 @@ pub(super) struct Offline<'a> {
 impl Offline<'_> {
     /// All answers, those of an earlier run included.
     pub fn run(&self, folder: &Path) -> Result<Vec<Answer>> {
-        let recorded = serde_json::json!({
+        let mut recorded = serde_json::json!({
             "objects": self.instances.iter().map(|i| i.name.as_str()).collect::<Vec<_>>(),
             "size": self.size, "seed": self.seed, "form": self.form, "network": self.network.fingerprint(), "gripper": self.gripper,
         });
+        if let Some(list) = self.recorded {
+            recorded["recorded"] = format!("{list:016x}").into();
+        }
         let (mut journal, rows) = Journal::open::<Answer>(&folder.join("answers.jsonl"), &recorded)?;
         let mut answers: BTreeMap<Question, Answer> =
             rows.into_iter().map(|r| (r.question.clone(), r)).collect();
@@ -189,21 +206,36 @@ impl Offline<'_> {
 
     /// The views used as experience, and the tested views.
     fn views(&self, number: usize, instance: &Instance) -> Result<(Vec<View>, Vec<View>)> {
-        let parts = ConvexParts::of_mesh(&instance.mesh, &PartsOptions::default())
-            .with_context(|| instance.name.clone())?;
+        let (mesh, grasp) = match &instance.shape {
+            Shape::Mesh(mesh, grasp) => (mesh, grasp),
+            Shape::Recorded(views) => return Ok(self.split(number, views)),
+        };
+        let parts =
+            ConvexParts::of_mesh(mesh, &PartsOptions::default()).with_context(|| instance.name.clone())?;
         let mut views = vec![];
         let wanted = POOL + self.size.views as usize;
         for k in 0..3 * wanted as u64 {
             if views.len() == wanted {
                 break;
             }
-            views.extend(self.view(number, &instance.mesh, &instance.grasp, &parts, k));
+            views.extend(self.view(number, mesh, grasp, &parts, k));
         }
         if views.len() < wanted {
             bail!("{}: the object stood upright in {} of {} views", instance.name, views.len(), 3 * wanted);
         }
         let tests = views.split_off(POOL);
         Ok((views, tests))
+    }
+
+    /// Recorded views in random order: the first half, at most [`POOL`], as experience; the others are tested.
+    fn split(&self, instance: usize, recorded: &[(Arc<GraspView>, Grasp)]) -> (Vec<View>, Vec<View>) {
+        let mut views: Vec<View> = (0..)
+            .zip(recorded)
+            .map(|(number, (view, wanted))| View { instance, number, view: view.clone(), wanted: *wanted })
+            .collect();
+        views.shuffle(&mut stream(self.seed ^ 0x7265_636f, instance as u64));
+        let tests = views.split_off((views.len() / 2).min(POOL));
+        (views, tests)
     }
 
     /// One view with its target grasp; `None` if the object did not stand upright or was not visible.
@@ -221,9 +253,9 @@ impl Offline<'_> {
         let (pose, width) = grasp;
         let camera_from_gripper = seen.world_from_camera.inverse() * scene.world_from_object * *pose;
         let quality = AntipodalQuality { alignment: 1.0, support: 1.0, centring: 1.0, observed: 0.5 };
-        let opening = (width + 0.024).min(self.gripper.max_opening);
+        let opening = (width + CLEARANCE).min(self.gripper.max_opening);
         let wanted = Grasp { camera_from_gripper, opening, width: *width, quality };
-        Some(View { instance, number, view, wanted })
+        Some(View { instance, number, view: Arc::new(view), wanted })
     }
 
     fn remember(&self, memory: &mut Memory, view: &View) -> Result<i64> {
@@ -321,6 +353,7 @@ impl Offline<'_> {
     ) -> Result<()> {
         let mut progress = Progress::new("stretched", self.instances.len() * self.size.stretched as usize);
         for (number, instance) in self.instances.iter().enumerate() {
+            let Shape::Mesh(mesh, _) = &instance.shape else { continue };
             for view in 0..self.size.stretched {
                 check_interrupt("what was answered is kept; run the same command again to continue")?;
                 progress.step(instance.name.clone());
@@ -334,9 +367,9 @@ impl Offline<'_> {
                     continue;
                 }
                 let stretch = Vec3::from(factors.map(|f| f as f64 / 100.0));
-                let vertices = instance.mesh.vertices();
+                let vertices = mesh.vertices();
                 let vertices = vertices.iter().map(|p| p.component_mul(&stretch)).collect();
-                let mesh = Mesh::new(vertices, instance.mesh.faces().to_vec())?;
+                let mesh = Mesh::new(vertices, mesh.faces().to_vec())?;
                 let Some(grasp) = from_above(&mesh, self.gripper) else { continue };
                 let Ok(parts) = ConvexParts::of_mesh(&mesh, &PartsOptions::default()) else { continue };
                 let Some(test) = self.view(number, &mesh, &grasp, &parts, 500 + view) else { continue };
