@@ -2,7 +2,8 @@
 //!
 //! Grasps are proposed from experience if some is near enough, otherwise from geometry alone. The best ones are tried until one
 //! holds, and a few others in addition. A grasp that held is stored as an experience, and every trial as an attempt. The caller
-//! executes the trials, in simulation or on a robot.
+//! executes the trials, in simulation or on a robot. In the published form (section 6.3.2) the grasps are those of DGCM-Net alone if
+//! experience is near enough, otherwise those of the caller's planner.
 //!
 //! All results of a task are stored together at its end: an interrupted task leaves nothing behind that would change the trials
 //! when it is repeated.
@@ -17,7 +18,8 @@ use thiserror::Error;
 
 use crate::model::DgcmModel;
 use crate::transfer::{
-    Kind, Memory, Proposals, ProposeError, ProposeOptions, Ranked, propose, rank_by_outcome, rank_on_part,
+    Kind, Memory, Proposals, ProposeError, ProposeOptions, Ranked, propose, rank_by_outcome,
+    rank_experience_as_published, rank_on_part,
 };
 
 /// Number of trials, and when experience is used.
@@ -35,6 +37,10 @@ pub struct LearnerOptions {
 
 /// Returns the name of the part on which a grasp is, or `None`.
 pub type PartOf<'a> = dyn Fn(&Grasp) -> Option<&'static str> + 'a;
+
+/// A planner's grasps on a view, in the order in which it would have them tried.
+pub type PlanGrasps<'a> =
+    dyn Fn(&GraspView, &AntipodalOptions) -> Result<Vec<Grasp>, Box<dyn StdError + Send + Sync>> + 'a;
 
 /// An object in front of the robot.
 pub struct GraspTask<'a> {
@@ -80,6 +86,9 @@ pub enum LearnError {
     /// The store.
     #[error(transparent)]
     Store(#[from] StoreError),
+    /// The planner of the published form.
+    #[error(transparent)]
+    Plan(Box<dyn StdError + Send + Sync>),
     /// The grasp could not be tried.
     #[error(transparent)]
     Try(Box<dyn StdError + Send + Sync>),
@@ -113,6 +122,22 @@ pub struct Learner<'a> {
     pub gripper: &'a Gripper,
     /// Options.
     pub options: &'a LearnerOptions,
+    /// The published form, with the planner for objects without near experience; `None` for ours.
+    pub published: Option<&'a PlanGrasps<'a>>,
+}
+
+/// A planner's grasp, which keeps its place.
+fn in_order(grasp: Grasp) -> Ranked {
+    let quality = grasp.quality.total();
+    Ranked {
+        grasp,
+        kind: Kind::Geometry,
+        score: quality,
+        geometry: quality,
+        experience: 0.0,
+        proposal: None,
+        members: 1,
+    }
 }
 
 impl Learner<'_> {
@@ -158,14 +183,22 @@ impl Learner<'_> {
         try_grasp: &mut TryGrasp<'_, T>,
         record: &mut Record,
     ) -> Result<Learned<T>, LearnError> {
-        let mut geometry = antipodal_grasps(task.view, self.gripper, &task.planner)?;
-        if let (Some(part_of), Some(part)) = (task.part_of, &self.options.part) {
-            geometry.retain(|grasp| part_of(grasp) == Some(part.as_str()));
-        }
         let fitter = GraspFitter::new(task.view, self.gripper, &task.planner)?;
         self.memory.refresh()?;
         let (nearest, found) = self.ask_experience(&fitter)?;
-        let ranked = self.rank(&geometry, found.as_ref(), &fitter, task.part_of.is_some());
+        let ranked = match (self.published, &found) {
+            (None, _) => {
+                let geometry = antipodal_grasps(task.view, self.gripper, &task.planner)?;
+                self.rank(&self.on_part(task, geometry), found.as_ref(), &fitter, task.part_of.is_some())
+            }
+            (Some(_), Some(found)) => {
+                rank_experience_as_published(&found.proposals, &ClusterOptions::default())
+            }
+            (Some(plan), None) => {
+                let planned = plan(task.view, &task.planner).map_err(LearnError::Plan)?;
+                self.on_part(task, planned).into_iter().map(in_order).collect()
+            }
+        };
         let from_experience = found.is_some();
         let mut learned = Learned { nearest, from_experience, last: None, held: false, stored: None };
         let mut left = 0;
@@ -197,11 +230,21 @@ impl Learner<'_> {
         if self.options.near <= 0.0 {
             return Ok((None, None));
         }
-        let options = ProposeOptions { part: self.options.part.clone(), ..ProposeOptions::default() };
+        let form =
+            if self.published.is_some() { ProposeOptions::published() } else { ProposeOptions::default() };
+        let options = ProposeOptions { part: self.options.part.clone(), ..form };
         let proposed = propose(fitter, self.network, self.memory, &options)?;
         let nearest = proposed.nearest.first().map(|m| m.distance);
         let near = nearest.is_some_and(|d| d < self.options.near);
         Ok((nearest, Some(proposed).filter(|p| !p.proposals.is_empty() && near)))
+    }
+
+    /// The grasps on the requested part, where the object's parts are known.
+    fn on_part(&self, task: &GraspTask<'_>, mut grasps: Vec<Grasp>) -> Vec<Grasp> {
+        if let (Some(part_of), Some(part)) = (task.part_of, &self.options.part) {
+            grasps.retain(|grasp| part_of(grasp) == Some(part.as_str()));
+        }
+        grasps
     }
 
     /// The grasps in the order in which they are tried.

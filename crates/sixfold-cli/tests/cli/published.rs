@@ -155,3 +155,40 @@ fn dgcm_trains_and_proposes_as_published() {
     assert!(!kinds(&combined).is_empty() && kinds(&combined).iter().all(|k| k == "geometry"), "{combined}");
     fails(dir, &format!("{with} --planner gpd"), &["--planner gpd", "--preset published-combined"]);
 }
+
+/// Section 6.3.2: GPD until experience is near enough, then DGCM-Net alone.
+#[cfg(feature = "physics")]
+#[test]
+fn a_hand_learns_as_published() {
+    let case = OneImage::new();
+    let dir = case.path();
+    let weights = concat!(env!("CARGO_MANIFEST_DIR"), "/../../weights/dgcm.safetensors");
+    let learn = |store: &str, options: &str| {
+        let learn = format!(
+            "grasp learn --experiences {store}.db --object part.ply --unit mm --attempts 4 --seed 1 --weights {weights} {options} \
+             --out {store} --json"
+        );
+        let whole = sixfold(dir, &learn).expect(0).json();
+        let tried = sixfold(dir, &format!("grasp store list {store}.db --attempts --json")).expect(0).json();
+        let tried = tried.as_array().unwrap().clone();
+        (whole["objects"][0]["from_experience"].clone(), tried)
+    };
+    let transferred = |tried: &[Value]| -> Value { tried.iter().map(|t| t["transferred"].clone()).collect() };
+    let first = |tried: &[Value]| tried[0]["description"].clone();
+    let (by_experience, tried) = learn("published", "--preset published --near 9");
+    let switched = by_experience.as_array().unwrap();
+    assert!(switched[0] == false && switched[3] == true, "{switched:?}");
+    assert_eq!(transferred(&tried), by_experience);
+    // Never near enough: the planner alone, which is not ours.
+    let (by_experience, planned) = learn("planned", "--preset published --near 0");
+    assert_eq!(by_experience, serde_json::json!([false, false, false, false]));
+    assert_eq!((transferred(&planned), first(&planned)), (by_experience, first(&tried)));
+    let (_, ours) = learn("ours", "--near 9");
+    assert_ne!(first(&ours), first(&tried));
+    // A run is not continued in the other form.
+    let other = format!(
+        "grasp learn --experiences ours.db --object part.ply --unit mm --attempts 4 --seed 1 --weights {weights} --near 9 \
+         --preset published --out ours"
+    );
+    fails(dir, &other, &["attempts.jsonl", "other options"]);
+}

@@ -4,11 +4,11 @@
 use std::path::PathBuf;
 
 use anyhow::{Context, Result, bail};
-use clap::Args;
+use clap::{Args, ValueEnum};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
-use sixfold_dgcm::learner::{GraspTask, JournalOf, Learned, Learner, LearnerOptions, PartOf};
+use sixfold_dgcm::learner::{GraspTask, JournalOf, Learned, Learner, LearnerOptions, PartOf, PlanGrasps};
 use sixfold_dgcm::transfer::Memory;
 use sixfold_experience::{ExperienceStore, JournalEntry, StorePlace, TaskRecord};
 use sixfold_geometry::{Pose, Vec3};
@@ -22,6 +22,7 @@ use super::experience::{
 };
 use super::journal::StoreJournal;
 use super::object_list::{ObjectsArguments, named_objects};
+use super::planner::Planner;
 use super::trial::{Hardness, PhysicsArguments, hardness, outcome_name};
 use crate::output::JsonArguments;
 use crate::progress::{Progress, check_interrupt};
@@ -54,6 +55,9 @@ pub struct LearnArguments {
     /// Number of further grasps tried in every scene, spread over the ranking; failures improve the ranking
     #[arg(long, value_name = "N", default_value = "0")]
     pub explore: usize,
+    /// Learn as published (section 6.3.2): DGCM-Net alone if the nearest experience is near enough, else GPD
+    #[arg(long, value_enum, value_name = "NAME")]
+    pub preset: Option<LearnPreset>,
     /// Maximum feature distance at which the nearest experience proposes the grasp; 0 for never (dissertation: 0.9)
     #[arg(long, value_name = "DISTANCE", default_value = "0.9")]
     pub near: f64,
@@ -78,6 +82,15 @@ pub struct LearnArguments {
     /// Where the result goes.
     #[command(flatten)]
     pub json: JsonArguments,
+}
+
+/// How experience is used in the dissertation.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum LearnPreset {
+    /// As in the dissertation
+    #[value(alias = "paper")]
+    Published,
 }
 
 /// An object of the learning run.
@@ -179,6 +192,8 @@ struct Recorded<'a> {
     tries: usize,
     explore: usize,
     near: f64,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    preset: Option<LearnPreset>,
     part: &'a Option<String>,
     hard: bool,
     seed: u64,
@@ -256,6 +271,7 @@ fn learn_with(a: &LearnArguments, wrap: impl FnOnce(BoxedStore) -> BoxedStore) -
         tries: a.tries,
         explore: a.explore,
         near: a.near,
+        preset: a.preset,
         part: &a.part,
         hard: a.hard,
         seed: a.seed,
@@ -273,7 +289,15 @@ fn learn_with(a: &LearnArguments, wrap: impl FnOnce(BoxedStore) -> BoxedStore) -
     let mut memory = Memory::new(store, &network)?;
     let options = LearnerOptions { tries: a.tries, explore: a.explore, near: a.near, part: a.part.clone() };
     let gripper = &setting.gripper;
-    let mut learner = Learner { network: &network, memory: &mut memory, gripper, options: &options };
+    let gpd = a.preset.map(|LearnPreset::Published| Planner::gpd(None)).transpose()?;
+    let plan = |view: &GraspView, options: &AntipodalOptions| {
+        let Some(gpd) = &gpd else { return Ok(vec![]) };
+        let grasps = gpd.grasps(view, gripper, options)?;
+        Ok(gpd.ranked(&grasps).into_iter().map(|cluster| cluster.best).collect())
+    };
+    let published = a.preset.map(|LearnPreset::Published| &plan as &PlanGrasps<'_>);
+    let mut learner =
+        Learner { network: &network, memory: &mut memory, gripper, options: &options, published };
     let mut progress = Progress::new("scenes", test_objects.len() * a.attempts as usize);
     for test_object in &test_objects {
         let done =

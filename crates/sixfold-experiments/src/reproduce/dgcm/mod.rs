@@ -23,14 +23,15 @@ use crate::grasp::compare::{self, CompareArguments};
 use crate::grasp::ways::METHODS;
 use sixfold_shell::Outcome;
 use sixfold_shell::grasp::experience::{NetworkArguments, OutboxArguments, memory, model};
-use sixfold_shell::grasp::learn::{self, Curve, LearnArguments};
+use sixfold_shell::grasp::learn::{self, Curve, LearnArguments, LearnPreset};
 use sixfold_shell::grasp::object_list::{Named, ObjectsArguments, PartBox, file_name, objects_with_parts};
 use sixfold_shell::grasp::planner::Planner;
 use sixfold_shell::grasp::trial::{Hardness, PhysicsArguments, hardness};
 use sixfold_shell::output::JsonArguments;
 
-/// Values of `--figure`: figure 6.7 in all forms, by the network alone, and as published; figures 6.10 to 6.12; figure 6.13.
-const FIGURES: [&str; 5] = ["6.7", "6.7-network", "6.7-published", "6.10", "6.13"];
+/// Values of `--figure`: figure 6.7 in all forms, by the network alone, and as published; figures 6.10 to 6.12, ours and as published;
+/// figure 6.13.
+const FIGURES: [&str; 6] = ["6.7", "6.7-network", "6.7-published", "6.10", "6.10-published", "6.13"];
 /// Largest feature distance at which experience proposes a grasp (dissertation, section 6.3.2).
 const NEAR: f64 = 0.9;
 /// Runs of learning from an empty store, each with its own seed.
@@ -59,7 +60,7 @@ pub(crate) struct ReproduceDgcmArguments {
     #[arg(long)]
     pub quick: bool,
     /// Measure only this figure of the dissertation: the errors of transferred grasps in all forms (6.7), by the network's
-    /// hypotheses alone or as published; learning from an empty store (6.10, also 6.11 and 6.12); handles (6.13)
+    /// hypotheses alone or as published; learning from an empty store (6.10, also 6.11 and 6.12), ours or as published; handles (6.13)
     #[arg(long, value_name = "FIGURE", value_parser = FIGURES)]
     pub figure: Option<String>,
     #[command(flatten)]
@@ -241,8 +242,9 @@ pub(crate) fn run(a: &ReproduceDgcmArguments, json: &JsonArguments) -> Result<Ou
         }
         let context = Context::of(a)?;
         match figure {
-            "6.10" => {
-                let learned = from_nothing(a, &context.objects)?;
+            "6.10" | "6.10-published" => {
+                let preset = (figure != "6.10").then_some(LearnPreset::Published);
+                let learned = from_nothing(a, &context.objects, preset)?;
                 draw_learning(&learned, &a.out)?;
                 let text = learning_markdown(&learned);
                 write_result(&a.out, "learning.json", &text, &learned, "learning.json is", json)?;
@@ -298,7 +300,7 @@ pub(crate) fn run(a: &ReproduceDgcmArguments, json: &JsonArguments) -> Result<Ou
     let context = Context::of(a)?;
     let transfer = context.transfer(a)?;
     eprintln!("4 of 5: figures 6.10 to 6.12, learning from nothing");
-    let incremental = from_nothing(a, &context.objects)?;
+    let incremental = from_nothing(a, &context.objects, None)?;
     eprintln!("5 of 5: figure 6.13, handles");
     let handles = context.handles(a)?;
     let whole = Whole { quick: a.quick, compare, transfer, incremental, handles };
@@ -308,7 +310,12 @@ pub(crate) fn run(a: &ReproduceDgcmArguments, json: &JsonArguments) -> Result<Ou
 }
 
 /// Figures 6.10 to 6.12: objects learned from an empty store.
-fn from_nothing(a: &ReproduceDgcmArguments, objects: &Named) -> Result<Vec<FromNothing>> {
+fn from_nothing(
+    a: &ReproduceDgcmArguments,
+    objects: &Named,
+    preset: Option<LearnPreset>,
+) -> Result<Vec<FromNothing>> {
+    let kept = if preset.is_some() { "incremental-published" } else { "incremental" };
     let mut incremental = vec![];
     for (name, path) in objects.iter().map(|o| (&o.1, a.path_of(&o.1))) {
         if !FROM_NOTHING.iter().any(|end| name.ends_with(end)) {
@@ -318,12 +325,13 @@ fn from_nothing(a: &ReproduceDgcmArguments, objects: &Named) -> Result<Vec<FromN
             let mut curves = vec![];
             for run in 0..if a.quick { 1 } else { RUNS } {
                 let setting = if hard { "hard" } else { "ordinary" };
-                let folder = format!("incremental/{}-{setting}-{run}", file_name(name));
+                let folder = format!("{kept}/{}-{setting}-{run}", file_name(name));
                 let store = a.out.join(&folder).join("experience.db");
                 let attempts = if a.quick { 3 } else { 16 };
                 let learned = learn::learn(&LearnArguments {
                     hard,
                     seed: a.seed + run,
+                    preset,
                     ..a.learning(&folder, &store, attempts, vec![path.clone()])
                 })?;
                 curves.extend(learned.objects);
@@ -369,6 +377,7 @@ impl ReproduceDgcmArguments {
             attempts,
             tries: 1,
             explore: 0,
+            preset: None,
             near: NEAR,
             part: None,
             hard: true,
