@@ -1,11 +1,12 @@
 //! Times a model at the size of the dissertation's renderings, and measures it beside averaging: `render_speed MODEL.safetensors
-//! [PHOTOGRAPHS]`.
+//! [PHOTOGRAPHS [published]]`; with `published` on the test views of `sixfold train nol --preset published`.
 
 use std::path::Path;
 use std::time::Instant;
 
 use sixfold_nol::model::NolModel;
 use sixfold_nol::quality::{QualityOptions, quality};
+use sixfold_nol::recipe::NolKind;
 use sixfold_nol::samples::{ViewSampleOptions, make_sample};
 use sixfold_synth::augment::{Backgrounds, PhotographOptions};
 
@@ -17,7 +18,12 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         Some(folder) => Backgrounds::from_folder(folder, &PhotographOptions::default())?,
         None => Backgrounds::procedural(),
     };
-    let options = ViewSampleOptions::default();
+    let published = arguments.next().is_some_and(|preset| preset == "published");
+    let (textures, options) = if published {
+        (textures.with_procedural_fraction(0.0), NolKind::Paper.options().samples)
+    } else {
+        (textures, ViewSampleOptions::default())
+    };
     for sources in [1, 6, 16] {
         let sample = make_sample(&textures, &options, 256, sources, 1, 0);
         let began = Instant::now();

@@ -1,6 +1,7 @@
 //! Templates of a dataset's objects from its own depth images, as the dissertation's real templates (section 5.3.4).
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
+use std::collections::btree_map::{BTreeMap, Entry};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -163,14 +164,14 @@ impl Reader<'_> {
         let mask = match scene.mask(im_id, index, MaskKind::Visible)? {
             Some(mask) if image.visible_fractions()[index].is_some() => mask,
             _ => {
-                let dataset = self.dataset;
-                for truth in &image.ground_truth {
-                    if !self.meshes.contains_key(&truth.obj_id) {
-                        self.meshes.insert(truth.obj_id, dataset.model(truth.obj_id, Models::Rendering)?);
-                    }
-                }
                 let truth = &image.ground_truth[index];
-                let placed = [(&self.meshes[&truth.obj_id], truth.camera_from_object)];
+                let mesh = match self.meshes.entry(truth.obj_id) {
+                    Entry::Occupied(known) => known.into_mut(),
+                    Entry::Vacant(place) => {
+                        place.insert(self.dataset.model(truth.obj_id, Models::Rendering)?)
+                    }
+                };
+                let placed = [(&*mesh, truth.camera_from_object)];
                 let mut visible = ground_truth_visibility(&placed, &camera, Some(&depth), VISIBILITY_DELTA);
                 match visible.pop().filter(|v| v.info.visib_fract >= MIN_VISIBLE) {
                     Some(visible) => visible.mask_visible,

@@ -56,8 +56,11 @@ pub(super) struct Row {
     pub by_haf: Option<bool>,
 }
 
+/// A method's answer in a row.
+type Answer = fn(&Row) -> Option<bool>;
+
 /// The methods' names and answers, in the order of the figure's columns.
-pub(super) const METHODS: [(&str, fn(&Row) -> Option<bool>); 6] = [
+pub(super) const METHODS: [(&str, Answer); 6] = [
     ("experience", |r| r.by_experience),
     ("network", |r| r.by_network),
     ("gpd and network", |r| r.by_gpd_and_network),
