@@ -9,7 +9,7 @@ pub struct ViewRange {
     /// Number of its poses.
     pub images: usize,
     /// The smallest interval with all azimuths about the z axis, from the x axis: it starts at -180 or later and below 180, and may
-    /// end above 180. `[-180, 180]` where no gap is wider than [`MAX_GAP`].
+    /// end above 180. `[-180, 180]` where no gap is wider than 15 degrees.
     pub azimuth: [f64; 2],
     /// The smallest and largest elevation over the xy plane.
     pub elevation: [f64; 2],
