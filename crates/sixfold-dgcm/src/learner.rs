@@ -12,7 +12,8 @@ use std::error::Error as StdError;
 
 use sixfold_experience::{Attempt, Crop, Experience, JournalEntry, StoreError, TaskRecord};
 use sixfold_grasp::{
-    AntipodalOptions, ClusterOptions, Grasp, GraspFitter, GraspView, Gripper, OptionsError, antipodal_grasps,
+    AntipodalOptions, ClusterOptions, Grasp, GraspCluster, GraspFitter, GraspView, Gripper, OptionsError,
+    antipodal_grasps,
 };
 use thiserror::Error;
 
@@ -38,9 +39,9 @@ pub struct LearnerOptions {
 /// Returns the name of the part on which a grasp is, or `None`.
 pub type PartOf<'a> = dyn Fn(&Grasp) -> Option<&'static str> + 'a;
 
-/// A planner's grasps on a view, in the order in which it would have them tried.
+/// A planner's clusters of grasps on a view, in the order in which it would have them tried.
 pub type PlanGrasps<'a> =
-    dyn Fn(&GraspView, &AntipodalOptions) -> Result<Vec<Grasp>, Box<dyn StdError + Send + Sync>> + 'a;
+    dyn Fn(&GraspView, &AntipodalOptions) -> Result<Vec<GraspCluster>, Box<dyn StdError + Send + Sync>> + 'a;
 
 /// An object in front of the robot.
 pub struct GraspTask<'a> {
@@ -126,20 +127,6 @@ pub struct Learner<'a> {
     pub published: Option<&'a PlanGrasps<'a>>,
 }
 
-/// A planner's grasp, which keeps its place.
-fn in_order(grasp: Grasp) -> Ranked {
-    let quality = grasp.quality.total();
-    Ranked {
-        grasp,
-        kind: Kind::Geometry,
-        score: quality,
-        geometry: quality,
-        experience: 0.0,
-        proposal: None,
-        members: 1,
-    }
-}
-
 impl Learner<'_> {
     /// Chooses grasps for a view, has them tried, and stores the results. If there is a journal of tasks, its row is stored in the
     /// same transaction.
@@ -188,15 +175,17 @@ impl Learner<'_> {
         let (nearest, found) = self.ask_experience(&fitter)?;
         let ranked = match (self.published, &found) {
             (None, _) => {
-                let geometry = antipodal_grasps(task.view, self.gripper, &task.planner)?;
-                self.rank(&self.on_part(task, geometry), found.as_ref(), &fitter, task.part_of.is_some())
+                let mut geometry = antipodal_grasps(task.view, self.gripper, &task.planner)?;
+                geometry.retain(|grasp| self.is_wanted(task, grasp));
+                self.rank(&geometry, found.as_ref(), &fitter, task.part_of.is_some())
             }
             (Some(_), Some(found)) => {
                 rank_experience_as_published(&found.proposals, &ClusterOptions::default())
             }
             (Some(plan), None) => {
                 let planned = plan(task.view, &task.planner).map_err(LearnError::Plan)?;
-                self.on_part(task, planned).into_iter().map(in_order).collect()
+                let wanted = planned.into_iter().filter(|cluster| self.is_wanted(task, &cluster.best));
+                wanted.map(Ranked::of_planner).collect()
             }
         };
         let from_experience = found.is_some();
@@ -239,12 +228,12 @@ impl Learner<'_> {
         Ok((nearest, Some(proposed).filter(|p| !p.proposals.is_empty() && near)))
     }
 
-    /// The grasps on the requested part, where the object's parts are known.
-    fn on_part(&self, task: &GraspTask<'_>, mut grasps: Vec<Grasp>) -> Vec<Grasp> {
-        if let (Some(part_of), Some(part)) = (task.part_of, &self.options.part) {
-            grasps.retain(|grasp| part_of(grasp) == Some(part.as_str()));
+    /// Whether a grasp is on the requested part; true for all where no part is requested or the object's parts are unknown.
+    fn is_wanted(&self, task: &GraspTask<'_>, grasp: &Grasp) -> bool {
+        match (task.part_of, &self.options.part) {
+            (Some(part_of), Some(part)) => part_of(grasp) == Some(part.as_str()),
+            _ => true,
         }
-        grasps
     }
 
     /// The grasps in the order in which they are tried.

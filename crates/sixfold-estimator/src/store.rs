@@ -12,7 +12,6 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
-use sixfold_geometry::nalgebra::Matrix4;
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_io::{LockError, WriteLock, limits, read_regular_text, sync_folder_of, write_atomically};
 use sixfold_mesh::{
@@ -234,9 +233,7 @@ impl ObjectRecord {
             ));
         }
         for rows in &self.symmetries_discrete {
-            let flat: Vec<f64> = rows.iter().flatten().copied().collect();
-            let pose = Pose::from_matrix(&Matrix4::from_row_slice(&flat))
-                .map_err(|e| format!("field symmetries_discrete: {e}"))?;
+            let pose = Pose::from_rows(rows).map_err(|e| format!("field symmetries_discrete: {e}"))?;
             if !(pose.translation().norm() <= FURTHEST) {
                 return Err(format!(
                     "field symmetries_discrete: found one that moves the object by more than {FURTHEST} m"

@@ -120,6 +120,14 @@ impl Pose {
         )
     }
 
+    /// From the rows of a 4x4 matrix, as JSON files hold it.
+    ///
+    /// # Errors
+    /// As [`Pose::from_matrix`].
+    pub fn from_rows(rows: &[[f64; 4]; 4]) -> Result<Self, PoseError> {
+        Pose::from_matrix(&Matrix4::from_fn(|i, k| rows[i][k]))
+    }
+
     /// The 4x4 matrix.
     pub fn to_matrix(&self) -> Matrix4<f64> {
         self.0.to_homogeneous()
@@ -283,6 +291,9 @@ mod tests {
         fn matrix_round_trip(t in twist()) {
             let p = Pose::exp(&t);
             let back = Pose::from_matrix(&p.to_matrix()).unwrap();
+            let matrix = p.to_matrix();
+            let rows = std::array::from_fn(|i| std::array::from_fn(|k| matrix[(i, k)]));
+            prop_assert_eq!(Pose::from_rows(&rows).unwrap(), back);
             prop_assert!((p.inverse() * back).log().amax() < 1e-9);
         }
     }

@@ -4,7 +4,6 @@ use std::path::Path;
 
 use serde::Deserialize;
 use serde::de::DeserializeOwned;
-use sixfold_geometry::nalgebra::Matrix4;
 use sixfold_geometry::{Pose, PoseError};
 use thiserror::Error;
 
@@ -146,11 +145,7 @@ fn read<T: DeserializeOwned>(path: &Path, expected: &'static str) -> Result<T, G
 }
 
 fn pose(file: &str, field: &'static str, rows: &Rows) -> Result<Pose, GraspFileError> {
-    Pose::from_matrix(&Matrix4::from_fn(|i, j| rows[i][j])).map_err(|source| GraspFileError::Pose {
-        file: file.to_owned(),
-        field,
-        source,
-    })
+    Pose::from_rows(rows).map_err(|source| GraspFileError::Pose { file: file.to_owned(), field, source })
 }
 
 #[cfg(test)]

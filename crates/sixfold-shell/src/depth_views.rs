@@ -5,7 +5,6 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, anyhow, bail};
 use clap::Args;
 use serde::Serialize;
-use sixfold_geometry::nalgebra::Matrix4;
 use sixfold_geometry::{Camera, DepthImage, Mask, Pose, undistort_depth};
 use sixfold_io::{CameraFile, read_depth, read_mask};
 use sixfold_mttm::mask_check::{CheckedMask, WORTH_A_WARNING, check_mask};
@@ -136,10 +135,6 @@ fn read_poses(path: &Path) -> Result<Vec<Pose>> {
         .with_context(|| format!("{}: expected a list of 4x4 matrices, row by row", path.display()))?;
     rows.iter()
         .enumerate()
-        .map(|(i, m)| {
-            let flat: Vec<f64> = m.iter().flatten().copied().collect();
-            Pose::from_matrix(&Matrix4::from_row_slice(&flat))
-                .with_context(|| format!("{}: pose {}", path.display(), i + 1))
-        })
+        .map(|(i, m)| Pose::from_rows(m).with_context(|| format!("{}: pose {}", path.display(), i + 1)))
         .collect()
 }

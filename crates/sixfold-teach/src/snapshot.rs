@@ -7,7 +7,6 @@ use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 use sixfold_board::{Board, Paper};
-use sixfold_geometry::nalgebra::Matrix4;
 use sixfold_geometry::{Camera, Mask, Plane, Pose, RgbImage, Vec3};
 use sixfold_io::{limits, read_depth, read_mask_and_hidden, read_regular_text, read_rgb};
 use sixfold_mesh::{Mesh, Unit, read_mesh};
@@ -256,8 +255,7 @@ impl Snapshot {
     }
 
     fn pose_of(&self, shape: &ShapeFacts) -> Result<Pose, TeachError> {
-        let flat: Vec<f64> = shape.board_from_object.iter().flatten().copied().collect();
-        Pose::from_matrix(&Matrix4::from_row_slice(&flat)).map_err(|e| TeachError::File {
+        Pose::from_rows(&shape.board_from_object).map_err(|e| TeachError::File {
             path: self.folder.join("teaching.json"),
             what: format!("field board_from_object: {e}"),
         })

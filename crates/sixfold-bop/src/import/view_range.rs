@@ -1,7 +1,7 @@
 //! From which sides images show an object (dissertation, table 4.2).
 
 use serde::Serialize;
-use sixfold_geometry::{Pose, Vec3};
+use sixfold_geometry::Pose;
 
 /// The images of an object, and the directions of the camera as seen from it. Angles are in degrees, in the object's frame.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
@@ -24,7 +24,7 @@ impl ViewRange {
         let mut azimuths = vec![];
         let mut elevation = [f64::INFINITY, f64::NEG_INFINITY];
         for pose in camera_from_object {
-            let camera = pose.inverse().transform_point(&Vec3::zeros());
+            let camera = pose.inverse().translation();
             azimuths.push(camera.y.atan2(camera.x).to_degrees());
             let over = camera.z.atan2(camera.x.hypot(camera.y)).to_degrees();
             elevation = [elevation[0].min(over), elevation[1].max(over)];
@@ -48,6 +48,7 @@ impl ViewRange {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use sixfold_geometry::Vec3;
 
     fn seen_from(azimuth: f64, elevation: f64) -> Pose {
         let (a, e) = (azimuth.to_radians(), elevation.to_radians());

@@ -8,7 +8,7 @@
 use sixfold_geometry::nalgebra::{Quaternion, UnitQuaternion};
 use sixfold_geometry::{Pose, Vec3};
 use sixfold_grasp::learned::ScoredGrasp;
-use sixfold_grasp::{ClusterOptions, Grasp, GraspFitter};
+use sixfold_grasp::{ClusterOptions, Grasp, GraspCluster, GraspFitter};
 
 use super::{Proposal, Proposals};
 use crate::outcome::OutcomeModel;
@@ -43,6 +43,19 @@ pub struct Ranked {
 }
 
 impl Ranked {
+    /// A grasp of a planner alone: the best of a cluster.
+    pub fn of_planner(cluster: GraspCluster) -> Ranked {
+        Ranked {
+            grasp: cluster.best,
+            kind: Kind::Geometry,
+            score: cluster.score,
+            geometry: cluster.best_score,
+            experience: 0.0,
+            proposal: None,
+            members: cluster.members,
+        }
+    }
+
     /// The success probability of a grasp of this origin.
     fn success_probability(&self, grasp: &Grasp, fitter: &GraspFitter<'_>, outcomes: &OutcomeModel) -> f64 {
         outcomes.success_probability(&fitter.describe(grasp), self.experience, self.kind == Kind::Experience)

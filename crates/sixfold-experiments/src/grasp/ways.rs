@@ -8,12 +8,12 @@ use std::time::Instant;
 use anyhow::Result;
 use sixfold_dgcm::model::DgcmModel;
 use sixfold_dgcm::transfer::{
-    Kind, Memory, ProposeOptions, Ranked, propose, rank, rank_as_published, rank_by_agreement,
-    rank_by_outcome, rank_experience_as_published,
+    Memory, ProposeOptions, Ranked, propose, rank, rank_as_published, rank_by_agreement, rank_by_outcome,
+    rank_experience_as_published,
 };
 use sixfold_grasp::learned::ScoredGrasp;
 use sixfold_grasp::{
-    AntipodalOptions, ClusterOptions, Grasp, GraspCluster, GraspFitter, GraspView, Gripper, antipodal_grasps,
+    AntipodalOptions, ClusterOptions, Grasp, GraspFitter, GraspView, Gripper, antipodal_grasps,
 };
 use sixfold_shell::grasp::planner::Planner;
 
@@ -164,14 +164,5 @@ impl Ways<'_> {
 
 /// The grasps of a trained planner alone.
 fn in_own_order(planner: &Planner, grasps: &[ScoredGrasp]) -> Vec<Ranked> {
-    let ranked = |c: GraspCluster| Ranked {
-        grasp: c.best,
-        kind: Kind::Geometry,
-        score: c.score,
-        geometry: c.best_score,
-        experience: 0.0,
-        proposal: None,
-        members: c.members,
-    };
-    planner.ranked(grasps).into_iter().map(ranked).collect()
+    planner.ranked(grasps).into_iter().map(Ranked::of_planner).collect()
 }

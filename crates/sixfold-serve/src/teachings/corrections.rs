@@ -7,7 +7,6 @@ use axum::extract::rejection::BytesRejection;
 use axum::extract::{Path, State};
 use axum::http::StatusCode;
 use serde::{Deserialize, de::DeserializeOwned};
-use sixfold_geometry::nalgebra::Matrix4;
 use sixfold_geometry::{Image, Mask, Pose, Vec2, Vec3};
 use sixfold_io::ImageFile;
 use sixfold_teach::{Teaching, pose_of_points};
@@ -114,11 +113,10 @@ fn pose_of(body: &PoseBody, teaching: &Teaching, number: usize) -> Answer<Pose> 
     let expected = "a rigid transform by rows, metres, that puts the board before the camera";
     let pose = match (&body.camera_from_board, &body.pairs) {
         (Some(rows), None) => {
-            let flat: Vec<f64> = rows.iter().flatten().copied().collect();
             let wrong = |e: &dyn std::fmt::Display| {
                 ApiError::about("camera_from_board", e, expected, "correct the matrix")
             };
-            Pose::from_matrix(&Matrix4::from_row_slice(&flat)).map_err(|e| wrong(&e))?
+            Pose::from_rows(rows).map_err(|e| wrong(&e))?
         }
         (None, Some(pairs)) => {
             let most = &pairs[..pairs.len().min(MAX_PAIRS)];

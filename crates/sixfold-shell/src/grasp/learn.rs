@@ -293,7 +293,7 @@ fn learn_with(a: &LearnArguments, wrap: impl FnOnce(BoxedStore) -> BoxedStore) -
     let plan = |view: &GraspView, options: &AntipodalOptions| {
         let Some(gpd) = &gpd else { return Ok(vec![]) };
         let grasps = gpd.grasps(view, gripper, options)?;
-        Ok(gpd.ranked(&grasps).into_iter().map(|cluster| cluster.best).collect())
+        Ok(gpd.ranked(&grasps))
     };
     let published = a.preset.map(|LearnPreset::Published| &plan as &PlanGrasps<'_>);
     let mut learner =

@@ -7,10 +7,13 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result};
 use serde::{Deserialize, Serialize};
 use sixfold_dgcm::model::DgcmModel;
-use sixfold_dgcm::transfer::{Memory, RankedGrasps, grasps_as_published, grasps_from_experience};
+use sixfold_dgcm::transfer::{
+    Memory, ProposeOptions, Ranked, propose, rank_as_published, rank_experience_as_published, rank_on_part,
+};
 use sixfold_geometry::{DepthImage, NormalOptions, Rect, RgbImage, Vec3, normals_from_depth};
 use sixfold_grasp::{
-    AntipodalOptions, DrawnGrasp, Grasp, GraspView, Gripper, centre_between_pads, draw_grasps,
+    AntipodalOptions, ClusterOptions, DrawnGrasp, Grasp, GraspFitter, GraspView, Gripper,
+    centre_between_pads, draw_grasps,
 };
 use sixfold_io::{read_rgb, write_rgb};
 use sixfold_mesh::Mesh;
@@ -171,25 +174,28 @@ impl Handles<'_> {
         part: &str,
     ) -> Result<[Option<Grasp>; METHODS.len()]> {
         let gripper = &self.setting.gripper;
-        let first = |found: RankedGrasps| found.ranked.first().map(|r| r.grasp);
+        let clusters = ClusterOptions::default();
+        let fitter = GraspFitter::new(view, gripper, options)?;
+        let mut found = |form: ProposeOptions| {
+            let options = ProposeOptions { part: Some(part.to_owned()), ..form };
+            propose(&fitter, self.network, memory, &options)
+        };
+        let (ours, published) = (found(ProposeOptions::default())?, found(ProposeOptions::published())?);
+        let outcomes = memory.outcomes(&gripper.name);
         let [gpd, haf] = self.planners;
-        let of_gpd = gpd.grasps(view, gripper, options)?;
-        let ours = grasps_from_experience(view, gripper, options, self.network, memory, Some(part))?;
-        let mut published =
-            |planned| grasps_as_published(view, gripper, options, self.network, memory, Some(part), planned);
-        let alone = published(None)?;
-        let joined = published(Some(of_gpd.as_slice()))?;
         let antipodal = Planner::Antipodal;
-        let of_antipodal = antipodal.grasps(view, gripper, options)?;
-        let of_haf = haf.grasps(view, gripper, options)?;
-        let planned = |planner: &Planner, grasps: &[_]| planner.ranked(grasps).first().map(|c| c.best);
+        let planned = |planner: &Planner| planner.grasps(view, gripper, options);
+        let (of_antipodal, of_gpd, of_haf) = (planned(&antipodal)?, planned(gpd)?, planned(haf)?);
+        let geometry: Vec<Grasp> = of_antipodal.iter().map(|scored| scored.grasp).collect();
+        let first = |ranked: Vec<Ranked>| ranked.first().map(|r| r.grasp);
+        let alone = |planner: &Planner, grasps: &[_]| planner.ranked(grasps).first().map(|c| c.best);
         Ok([
-            first(ours),
-            first(alone),
-            first(joined),
-            planned(&antipodal, &of_antipodal),
-            planned(gpd, &of_gpd),
-            planned(haf, &of_haf),
+            first(rank_on_part(&geometry, &ours, &clusters, &fitter, &outcomes)),
+            first(rank_experience_as_published(&published.proposals, &clusters)),
+            first(rank_as_published(&of_gpd, &published.proposals, &clusters)),
+            alone(&antipodal, &of_antipodal),
+            alone(gpd, &of_gpd),
+            alone(haf, &of_haf),
         ])
     }
 }

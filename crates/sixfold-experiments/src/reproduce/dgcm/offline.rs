@@ -25,7 +25,6 @@ use sixfold_grasp::{
 use sixfold_mesh::Mesh;
 use sixfold_simulation::{AttemptOptions, ConvexParts, PartsOptions, scene};
 
-use super::recorded::CLEARANCE;
 use sixfold_shell::grasp::journal::Journal;
 use sixfold_shell::progress::{Progress, check_interrupt};
 
@@ -35,6 +34,9 @@ const POOL: usize = 8;
 pub(super) const COUNTS: [usize; 4] = [1, 2, 4, 8];
 /// Clearance for the fingers, metres: an object wider than the open gripper minus this clearance has no grasp from above.
 const ROOM: f64 = 0.01;
+
+/// How much further than the object's width the gripper opens, metres.
+const CLEARANCE: f64 = 0.024;
 
 /// An object with its target grasp.
 pub(super) struct Instance {
@@ -88,7 +90,14 @@ fn from_above(mesh: &Mesh, gripper: &Gripper) -> Option<(Pose, f64)> {
     Some((gripper_pose(&tip, &-Vec3::z(), &closing)?, width))
 }
 
-/// One simulated view of an object.
+/// The target grasp at this pose, where the object has this width in metres.
+pub(super) fn wanted(camera_from_gripper: Pose, width: f64, gripper: &Gripper) -> Grasp {
+    let quality = AntipodalQuality { alignment: 1.0, support: 1.0, centring: 1.0, observed: 0.5 };
+    let opening = (width + CLEARANCE).min(gripper.max_opening);
+    Grasp { camera_from_gripper, opening, width, quality }
+}
+
+/// One view of an object.
 struct View {
     instance: usize,
     number: u64,
@@ -252,9 +261,7 @@ impl Offline<'_> {
         let (Some(view), Some(seen), true) = (scene.view, scene.seen, upright) else { return None };
         let (pose, width) = grasp;
         let camera_from_gripper = seen.world_from_camera.inverse() * scene.world_from_object * *pose;
-        let quality = AntipodalQuality { alignment: 1.0, support: 1.0, centring: 1.0, observed: 0.5 };
-        let opening = (width + CLEARANCE).min(self.gripper.max_opening);
-        let wanted = Grasp { camera_from_gripper, opening, width: *width, quality };
+        let wanted = wanted(camera_from_gripper, *width, self.gripper);
         Some(View { instance, number, view: Arc::new(view), wanted })
     }
 

@@ -7,16 +7,12 @@ use std::sync::Arc;
 use anyhow::{Context, Result, bail};
 use serde::Deserialize;
 use sixfold_geometry::Pose;
-use sixfold_geometry::nalgebra::Matrix4;
-use sixfold_grasp::{AntipodalQuality, Grasp, Gripper};
+use sixfold_grasp::{Grasp, GraspView, Gripper};
 use sixfold_io::{fnv1a, limits, read_regular_text};
 
 use sixfold_shell::grasp::input::{self, InputArguments};
 
-use super::offline::{Instance, Shape};
-
-/// How much further than the object's width the gripper opens, metres.
-pub(super) const CLEARANCE: f64 = 0.024;
+use super::offline::{Instance, Shape, wanted};
 
 /// One image of the list, with a grasp on it. Files are relative to the list.
 #[derive(Deserialize)]
@@ -85,9 +81,8 @@ pub(super) fn instances(list: &Path, gripper: &Gripper) -> Result<(Vec<Instance>
 }
 
 impl Image {
-    fn view(&self, folder: &Path, gripper: &Gripper) -> Result<(Arc<sixfold_grasp::GraspView>, Grasp)> {
-        let flat: Vec<f64> = self.camera_from_gripper.iter().flatten().copied().collect();
-        let pose = Pose::from_matrix(&Matrix4::from_row_slice(&flat)).context("camera_from_gripper")?;
+    fn view(&self, folder: &Path, gripper: &Gripper) -> Result<(Arc<GraspView>, Grasp)> {
+        let pose = Pose::from_rows(&self.camera_from_gripper).context("camera_from_gripper")?;
         if !(self.width > 0.0 && self.width <= gripper.max_opening) {
             bail!(
                 "width: found {} m, expected above 0 and at most {} m, which {} can open",
@@ -105,8 +100,6 @@ impl Image {
         let Some(view) = input::read(&files, None, 0)?.view else {
             bail!("{}: no object found on the table; give mask", files.depth.display());
         };
-        let quality = AntipodalQuality { alignment: 1.0, support: 1.0, centring: 1.0, observed: 0.5 };
-        let opening = (self.width + CLEARANCE).min(gripper.max_opening);
-        Ok((Arc::new(view), Grasp { camera_from_gripper: pose, opening, width: self.width, quality }))
+        Ok((Arc::new(view), wanted(pose, self.width, gripper)))
     }
 }
