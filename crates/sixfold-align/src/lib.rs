@@ -19,4 +19,4 @@ pub use evidence::{ColorEvidence, ColorGradients, DepthEvidence, Evidence, Evide
 pub use mesh::{VerificationMesh, VerificationMeshError, could_be_simplified, verification_mesh};
 pub use prepared::{DepthOptions, DepthRegion, PreparedDepth, PreparedDepthError};
 pub use verification::{VerificationOptions, VerificationScore, Verifier};
-pub use verify::{VerifiedPose, refine, verify};
+pub use verify::{VerifiedPose, refine, verify, verify_published};

@@ -82,6 +82,12 @@ pub trait PoseEstimator: Send + Sync {
         true
     }
 
+    /// A hash of what the method holds of the object with this id that is neither in the object's files nor among the method's
+    /// options, such as templates from other images. A run that is resumed compares it. `None`: nothing.
+    fn held(&self, _id: u32) -> Option<u64> {
+        None
+    }
+
     /// Computes once from an object the data that every query needs; slow results are stored in the object's
     /// folder ([`Object::file`]).
     ///

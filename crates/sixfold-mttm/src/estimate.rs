@@ -6,7 +6,9 @@ use std::time::Instant;
 
 use rayon::prelude::*;
 use serde::Serialize;
-use sixfold_align::{DepthRegion, VerificationOptions, VerificationScore, verify};
+use sixfold_align::{
+    DepthRegion, VerificationOptions, VerificationScore, VerifiedPose, verify, verify_published,
+};
 use sixfold_geometry::{OptionError, Pose, Vec3};
 use sixfold_mesh::Mesh;
 
@@ -52,7 +54,7 @@ pub struct MttmOptions {
     pub proposals: ProposalOptions,
     /// Regions of the first matching whose templates are aligned with the scene.
     pub placed: usize,
-    /// Those of them that get a mask.
+    /// Those of them that get a mask; in the published form, regions left after the rejection (dissertation: 50).
     pub masked: usize,
     /// Regions left after merging.
     pub regions: usize,
@@ -168,7 +170,7 @@ impl MttmOptions {
 
     /// Largest distance in depth at which a pixel agrees, metres; as published 10 mm, and 5 mm for small objects (section 5.3.1:
     /// ape and duck, the two smallest).
-    fn depth_threshold(&self, diameter: f64) -> f64 {
+    pub(crate) fn depth_threshold(&self, diameter: f64) -> f64 {
         match self.verification.depth_threshold {
             None if self.published => {
                 if diameter < SMALL {
@@ -582,28 +584,29 @@ fn verify_all(
     let templates = &object.templates;
     let threshold = options.depth_threshold(templates.diameter);
     let most = options.verified.max(VERIFIED_OF_INSTANCE * options.max_instances);
-    let kept: Vec<&Placed> = hypotheses.iter().take(most).collect();
     let pose_of = |p: &Placed| p.camera_from_view * templates.templates[p.template].view_from_object;
-    let poses: Vec<Pose> = kept.iter().map(|p| pose_of(p)).collect();
+    let best: Vec<&Placed> = hypotheses.iter().take(most).collect();
+    // Pose, confidence, score, and the number of the hypothesis.
     let mut judged: Vec<(Pose, f64, VerificationScore, usize)> = match &object.mesh {
-        None => {
-            kept.iter().zip(poses).enumerate().map(|(i, (p, pose))| (pose, p.support, p.score, i)).collect()
+        None => best.iter().enumerate().map(|(i, p)| (pose_of(p), p.support, p.score, i)).collect(),
+        Some(mesh) if options.published => {
+            // Sections 5.2.5 and 5.3.3: S_D S_B S_N of the rendered mesh alone, of all hypotheses and then of the best ones.
+            let poses: Vec<Pose> = hypotheses.iter().map(pose_of).collect();
+            verify_published(scene, mesh, &poses, most, threshold, &options.verification)
+                .into_iter()
+                .map(|(i, v)| (v.camera_from_object, v.score.total, v.score, i))
+                .collect()
         }
-        Some(mesh) => verify(scene, mesh, &poses, threshold, &options.verification)
-            .into_iter()
-            .zip(&kept)
-            .enumerate()
-            .map(|(i, (v, p))| {
-                let confidence = if options.published {
-                    // Section 5.2.5: S_D S_B S_N of the rendered mesh alone.
-                    v.score.total
-                } else {
-                    // Both the rendered mesh and the matched template count, and how much of the object is visible.
-                    v.score.ranking() * p.support.clamp(0.0, 1.0).powf(TEMPLATE_POWER)
-                };
-                (v.camera_from_object, confidence, v.score, i)
-            })
-            .collect(),
+        Some(mesh) => {
+            let poses: Vec<Pose> = best.iter().map(|p| pose_of(p)).collect();
+            let verified = verify(scene, mesh, &poses, threshold, &options.verification);
+            // Both the rendered mesh and the matched template count, and how much of the object is visible.
+            let confidence = |v: &VerifiedPose, p: &Placed| {
+                v.score.ranking() * p.support.clamp(0.0, 1.0).powf(TEMPLATE_POWER)
+            };
+            let numbered = verified.iter().zip(&best).enumerate();
+            numbered.map(|(i, (v, p))| (v.camera_from_object, confidence(v, p), v.score, i)).collect()
+        }
     };
     judged.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.3.cmp(&b.3)));
     let mut estimates: Vec<MttmEstimate> = vec![];
@@ -611,12 +614,12 @@ fn verify_all(
         if estimates.len() >= options.max_instances || confidence < options.min_score {
             break;
         }
-        let template = kept[i].template;
+        let template = hypotheses[i].template;
         let of_template = || {
-            let (pose, tolerance) = (&kept[i].camera_from_view, object.matcher.tolerance());
+            let (pose, tolerance) = (&hypotheses[i].camera_from_view, object.matcher.tolerance());
             template_mask(scene, &templates.templates[template], templates.size, pose, tolerance, 1)
         };
-        let mask = kept[i].mask.as_deref().cloned().unwrap_or_else(of_template);
+        let mask = hypotheses[i].mask.as_deref().cloned().unwrap_or_else(of_template);
         let shared =
             |other: &MttmEstimate| MAX_SHARED.1 * common(&mask, &other.mask) > MAX_SHARED.0 * mask.len();
         if mask.is_empty() || estimates.iter().any(shared) {

@@ -9,6 +9,7 @@ use sixfold_estimator::{
     EstimatorError, MinConfidence, Need, Needs, Object, PoseEstimate, PoseEstimator, PreparedObject, Query,
     downcast,
 };
+use sixfold_io::fnv1a;
 use sixfold_mesh::Mesh;
 
 use crate::error::StoreError;
@@ -145,6 +146,10 @@ impl PoseEstimator for MttmEstimator {
 
     fn depth_options(&self) -> DepthOptions {
         self.depth
+    }
+
+    fn held(&self, id: u32) -> Option<u64> {
+        self.given.get(&id).map(|templates| fnv1a(&templates.to_bytes()))
     }
 
     /// Right poses in real frames have confidences of 0.36 to 0.73, wrong ones up to 0.54 (LM-O frame 3, by `cargo test --release

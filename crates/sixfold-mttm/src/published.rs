@@ -1,7 +1,8 @@
 //! Regions and hypotheses as published (dissertation, section 5.2.4): descriptors alone choose templates, the mask head predicts
 //! the object's pixels before any alignment, overlapping masks are merged to one region, and each region has the five nearest
 //! templates of a second matching without its background. A region whose first hypothesis does not cover its mask after three
-//! iterations of ICP is left out (section 5.2.5).
+//! iterations of ICP is left out (section 5.2.5); of the others those remain whose first hypothesis has the largest portion of
+//! inliers (section 5.3.3).
 //!
 //! The dissertation does not say how many regions get a mask, nor how the 30 % of overlap are defined: here [`SELECTED`], and
 //! intersection over union. A template is placed so that its visible centroid coincides with that of the predicted mask.
@@ -14,6 +15,7 @@ use sixfold_geometry::{Pose, Vec2, Vec3};
 
 use crate::align::align_shortly;
 use crate::estimate::{KnownObject, MttmOptions, Placed, Stages, place_at};
+use crate::judge::judge;
 use crate::learned::Learned;
 use crate::mask::{Pixels, common, template_mask};
 use crate::matching::Entry;
@@ -39,7 +41,7 @@ const STRIDE: usize = 2;
 /// Fewest pixels of a mask on these columns and rows; chosen by hand, not swept.
 pub(crate) const MIN_MASK: usize = 20;
 
-/// The hypotheses of all regions, aligned with the scene; each has the mask of its region.
+/// The hypotheses of the at most [`MttmOptions::masked`] regions, aligned with the scene; each has the mask of its region.
 pub(crate) fn hypotheses(
     scene: &DepthRegion,
     object: &KnownObject,
@@ -67,28 +69,36 @@ pub(crate) fn hypotheses(
             (regions.rois[i], mask_pixels(scene, &regions.rois[i], size, &output.mask, STRIDE))
         })
         .collect();
-    let kept = merged(masks, options.masked);
-    stages.regions = kept.len();
-    let centred: Vec<(Roi, Pixels)> = kept
+    let centred: Vec<(Roi, Pixels)> = merged(masks)
         .into_iter()
         .filter_map(|(_, mask)| Some((Roi { centre: centroid(scene, &mask)? }, mask)))
         .collect();
-    // Sequentially: each region runs the network in parallel itself.
-    let found: Vec<Vec<Placed>> =
-        centred.par_iter().map(|(roi, mask)| region(scene, object, learned, roi, mask, options)).collect();
-    found.concat()
+    let accepted: Vec<Region> = centred
+        .par_iter()
+        .filter_map(|(roi, mask)| Region::new(scene, object, learned, roi, mask, options))
+        .collect();
+    let accepted = most_inliers(accepted, options.masked);
+    stages.regions = accepted.len();
+    accepted.par_iter().map(|r| r.placed(scene, object, options)).collect::<Vec<_>>().concat()
 }
 
-/// The masks without those that overlap an earlier one, at most `most`.
-fn merged(masks: Vec<(Roi, Pixels)>, most: usize) -> Vec<(Roi, Pixels)> {
+/// The masks that are large enough, without those that overlap an earlier one.
+fn merged(masks: Vec<(Roi, Pixels)>) -> Vec<(Roi, Pixels)> {
     let mut kept: Vec<(Roi, Pixels)> = vec![];
     for (roi, mask) in masks {
         let known = kept.iter().any(|(_, other)| overlaps(&mask, other, MERGED));
-        if kept.len() < most && mask.len() >= MIN_MASK && !known {
+        if mask.len() >= MIN_MASK && !known {
             kept.push((roi, mask));
         }
     }
     kept
+}
+
+/// At most `most` regions, those with the largest portion of inliers first; of equal ones the earlier is first.
+fn most_inliers(mut regions: Vec<Region>, most: usize) -> Vec<Region> {
+    regions.sort_by(|a, b| b.inliers.total_cmp(&a.inliers));
+    regions.truncate(most);
+    regions
 }
 
 /// Whether the intersection of two masks exceeds a fraction of the smaller one.
@@ -96,46 +106,57 @@ pub(crate) fn overlaps(a: &Pixels, b: &Pixels, fraction: f64) -> bool {
     common(a, b) as f64 > fraction * a.len().min(b.len()) as f64
 }
 
-/// The second matching of one region, and whether its first hypothesis covers its mask.
-fn region(
-    scene: &DepthRegion,
-    object: &KnownObject,
-    learned: &Learned,
-    roi: &Roi,
-    first_mask: &Pixels,
-    options: &MttmOptions,
-) -> Vec<Placed> {
-    let (model, size) = (learned.model(), learned.size());
-    let patch = Patch::of_scene(scene, roi, size, model.side(), |_| true);
-    let encoded = model.encode(&[&patch]);
-    let bare = model.without_background(&encoded, cells_of(scene, roi, size, first_mask));
-    let Some(descriptor) = model.describe(&bare).into_iter().next() else { return vec![] };
-    let camera_from_roi = roi.camera_from_roi();
-    let entries = nearest_entries(object, learned, &camera_from_roi, &descriptor, options.hypotheses);
-    if entries.is_empty() {
-        return vec![];
+/// A region that was not rejected.
+#[derive(Debug, Clone)]
+struct Region {
+    /// The object's pixels, predicted for the first hypothesis.
+    mask: Arc<Pixels>,
+    /// Templates and the poses that the network predicts for them.
+    hypotheses: Vec<(Entry, Pose)>,
+    /// Inliers among the points of the first hypothesis' template after three iterations of ICP, as a fraction.
+    inliers: f64,
+}
+
+impl Region {
+    /// The second matching of one region; `None` if its first hypothesis does not cover its mask.
+    fn new(
+        scene: &DepthRegion,
+        object: &KnownObject,
+        learned: &Learned,
+        roi: &Roi,
+        first_mask: &Pixels,
+        options: &MttmOptions,
+    ) -> Option<Region> {
+        let (model, size) = (learned.model(), learned.size());
+        let patch = Patch::of_scene(scene, roi, size, model.side(), |_| true);
+        let encoded = model.encode(&[&patch]);
+        let bare = model.without_background(&encoded, cells_of(scene, roi, size, first_mask));
+        let descriptor = model.describe(&bare).into_iter().next()?;
+        let camera_from_roi = roi.camera_from_roi();
+        let entries = nearest_entries(object, learned, &camera_from_roi, &descriptor, options.hypotheses);
+        let first = entries.first()?;
+        let regions = Encoded::joined(&vec![encoded; entries.len()]);
+        let output = model.compare(&regions, &learned.templates(&entries));
+        // One mask per region, predicted for its first hypothesis.
+        let mask = mask_pixels(scene, roi, size, &output[0].mask, 1);
+        let centre = centroid(scene, &mask)?;
+        let poses: Vec<Pose> = entries
+            .iter()
+            .zip(&output)
+            .map(|(entry, output)| start(object, &camera_from_roi, &centre, entry, output, options))
+            .collect();
+        let inliers = inliers(scene, object, first, &poses[0], &mask, options)?;
+        Some(Region { mask: Arc::new(mask), hypotheses: entries.into_iter().zip(poses).collect(), inliers })
     }
-    let regions = Encoded::joined(&vec![encoded; entries.len()]);
-    let output = model.compare(&regions, &learned.templates(&entries));
-    // One mask per region, predicted for its first hypothesis.
-    let mask = Arc::new(mask_pixels(scene, roi, size, &output[0].mask, 1));
-    let Some(centre) = centroid(scene, &mask) else { return vec![] };
-    let starts: Vec<Pose> = entries
-        .iter()
-        .zip(&output)
-        .map(|(entry, output)| start(object, &camera_from_roi, &centre, entry, output, options))
-        .collect();
-    if !covers(scene, object, &entries[0], &starts[0], &mask) {
-        return vec![];
+
+    /// Its hypotheses, aligned with the scene.
+    fn placed(&self, scene: &DepthRegion, object: &KnownObject, options: &MttmOptions) -> Vec<Placed> {
+        let place = |(entry, pose): &(Entry, Pose)| Placed {
+            mask: Some(self.mask.clone()),
+            ..place_at(scene, object, entry.template, *pose, 1.0, options)
+        };
+        self.hypotheses.iter().map(place).collect()
     }
-    entries
-        .iter()
-        .zip(starts)
-        .map(|(entry, start)| Placed {
-            mask: Some(mask.clone()),
-            ..place_at(scene, object, entry.template, start, 1.0, options)
-        })
-        .collect()
 }
 
 /// The pose of a template whose visible centroid is at `centre`, with the rotation that the network predicts.
@@ -159,13 +180,26 @@ pub(crate) fn start(
     Pose::new(rotation, centre - rotation * of_template)
 }
 
-/// Whether a hypothesis, after three iterations of ICP, covers enough of its mask.
-fn covers(scene: &DepthRegion, object: &KnownObject, entry: &Entry, start: &Pose, mask: &Pixels) -> bool {
+/// The portion of inliers among the points of a template after three iterations of ICP; `None` if it does not cover enough of the
+/// mask there.
+fn inliers(
+    scene: &DepthRegion,
+    object: &KnownObject,
+    entry: &Entry,
+    start: &Pose,
+    mask: &Pixels,
+    options: &MttmOptions,
+) -> Option<f64> {
     let surface = &object.surfaces[entry.template];
     let aligned = align_shortly(scene, &surface.sparse, start, object.matcher.tolerance());
     let template = &object.templates.templates[entry.template];
     let area = template_mask(scene, template, object.templates.size, &aligned, f64::INFINITY, 1);
-    overlap(&area, mask) >= MIN_OVERLAP
+    if overlap(&area, mask) < MIN_OVERLAP {
+        return None;
+    }
+    let threshold = options.depth_threshold(object.templates.diameter);
+    let score = judge(scene, surface, &aligned, threshold, &options.verification);
+    Some(score.inliers as f64 / score.rendered.max(1) as f64)
 }
 
 /// Intersection over union.
@@ -314,9 +348,18 @@ mod tests {
         let mask = |range: std::ops::Range<u32>| (roi(0.0), range.collect::<Pixels>());
         // The second shares 60 of its 100 pixels with the first, the third 40, and the last is too small.
         let masks = vec![mask(0..100), mask(40..140), mask(60..160), mask(500..510)];
-        let kept = merged(masks.clone(), 50);
+        let kept = merged(masks);
         assert_eq!(kept.iter().map(|k| k.1[0]).collect::<Vec<_>>(), [0, 60]);
-        assert_eq!(merged(masks, 1).len(), 1);
+    }
+
+    #[test]
+    fn regions_with_the_largest_portion_of_inliers_remain() {
+        let region =
+            |inliers: f64, pixel: u32| Region { mask: Arc::new(vec![pixel]), hypotheses: vec![], inliers };
+        let regions = vec![region(0.3, 1), region(0.8, 2), region(0.1, 3), region(0.8, 4)];
+        let pixels = |most| most_inliers(regions.clone(), most).iter().map(|r| r.mask[0]).collect::<Vec<_>>();
+        assert_eq!(pixels(3), [2, 4, 1]);
+        assert_eq!(pixels(50), [2, 4, 1, 3]);
     }
 
     #[test]

@@ -231,7 +231,7 @@ fn as_published_masks_come_first_and_poses_from_them() {
         }
     }
     println!("{overlaps:.2?} {right}");
-    // Measured: 0.26, 0.72, 0.82, 0.87, and four poses of four.
+    // Measured: 0.60, 0.49, 0.82, 0.87, and four poses of four.
     assert!(overlaps.iter().filter(|o| **o > 0.5).count() >= 3, "{overlaps:.2?}");
     assert!(right >= 3, "{right} of 4");
 }

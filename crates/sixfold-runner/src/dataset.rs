@@ -165,7 +165,8 @@ impl DatasetRun<'_> {
         }
         let ids: BTreeSet<u32> = self.targets.iter().filter_map(|t| t.object).map(|o| o.obj_id).collect();
         for id in ids {
-            record.object(id, &Inputs::of_object(self.dataset, id, work.infos.as_ref()))?;
+            let held = self.estimator.held(id);
+            record.object(id, &Inputs::of_object(self.dataset, id, work.infos.as_ref(), held))?;
         }
         record.check_images(stop, |scene_id, im_id| self.inputs_of(&work, scene_id, im_id))?;
         let mut rows = open_results(results, &mut record, events)?;

@@ -21,13 +21,23 @@ pub(crate) fn hex(hash: u64) -> String {
 }
 
 impl Inputs {
-    /// The mesh of an object with its diameter and symmetries.
-    pub(crate) fn of_object(dataset: &BopDataset, id: u32, infos: Option<&ModelsInfo>) -> Inputs {
+    /// The mesh of an object with its diameter and symmetries, and what a method holds of it ([`PoseEstimator::held`]).
+    ///
+    /// [`PoseEstimator::held`]: sixfold_estimator::PoseEstimator::held
+    pub(crate) fn of_object(
+        dataset: &BopDataset,
+        id: u32,
+        infos: Option<&ModelsInfo>,
+        held: Option<u64>,
+    ) -> Inputs {
         let mut inputs = Inputs::default();
         let model = dataset.model_path(id, Models::Rendering);
         let info = model.with_file_name("models_info.json");
         inputs.file("mesh", Some(model));
         inputs.value("models_info", &infos.and_then(|i| i.0.get(&id)), info);
+        if held.is_some() {
+            inputs.value("set of given templates", &held, dataset.root().to_owned());
+        }
         inputs
     }
 

@@ -70,18 +70,21 @@ fn of_images(
     for scene_id in images.iter().map(|i| i.0).collect::<BTreeSet<u32>>() {
         scenes.insert(scene_id, dataset.scene(scene_id)?);
     }
-    let mut reader = Reader { dataset, scenes, meshes: BTreeMap::new() };
+    let mut reader = Reader { dataset, scenes, meshes: BTreeMap::new(), depth: None };
     let places = reader.places(&images, ids)?;
-    let total = places.values().map(Vec::len).sum();
-    let mut progress = Progress::new("depth images for templates", total);
+    let mut views: BTreeMap<u32, Vec<View>> = places.keys().map(|id| (*id, vec![])).collect();
+    // Image by image, so that each depth image is read once.
+    let mut places: Vec<(Place, u32)> =
+        places.into_iter().flat_map(|(id, places)| places.into_iter().map(move |p| (p, id))).collect();
+    places.sort();
+    let mut progress = Progress::new("views for templates", places.len());
+    for (place, id) in places {
+        check_interrupt("no pose was estimated yet")?;
+        views.entry(id).or_default().extend(reader.view(place)?);
+        progress.step(format!("image {}/{}, object {id}", place.scene_id, place.im_id));
+    }
     let mut templates = BTreeMap::new();
-    for (id, places) in places {
-        let mut views = vec![];
-        for place in places {
-            check_interrupt("no pose was estimated yet")?;
-            views.extend(reader.view(place)?);
-            progress.step(format!("object {id}"));
-        }
+    for (id, views) in views {
         if views.is_empty() {
             bail!(
                 "--template-images: no depth image of {} shows object {id} at least {:.0} % visible; choose other images, or leave \
@@ -114,7 +117,7 @@ impl View {
 }
 
 /// An object in an image: the scene, the image, and the object's place in the image's ground truth.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 struct Place {
     scene_id: u32,
     im_id: u32,
@@ -126,6 +129,8 @@ struct Reader<'a> {
     scenes: BTreeMap<u32, Scene>,
     /// Models that were needed for a mask.
     meshes: BTreeMap<u32, Mesh>,
+    /// The last depth image, with the numbers of its scene and image.
+    depth: Option<((u32, u32), DepthImage)>,
 }
 
 impl Reader<'_> {
@@ -155,12 +160,19 @@ impl Reader<'_> {
         let scene = &self.scenes[&scene_id];
         let image = scene.image(im_id)?;
         let camera = scene.camera(im_id)?;
-        let Some(depth) = scene.depth(im_id)? else {
-            bail!(
-                "--template-images: image {scene_id}/{im_id} of {} has no depth image; simulate it with `sixfold simulate-depth`",
-                self.dataset.split()
-            );
+        let read = || -> Result<DepthImage> {
+            scene.depth(im_id)?.with_context(|| {
+                format!(
+                    "--template-images: image {scene_id}/{im_id} of {} has no depth image; simulate it with `sixfold simulate-depth`",
+                    self.dataset.split()
+                )
+            })
         };
+        let depth = match self.depth.take() {
+            Some((of, depth)) if of == (scene_id, im_id) => depth,
+            _ => read()?,
+        };
+        let depth = &self.depth.insert(((scene_id, im_id), depth)).1;
         let mask = match scene.mask(im_id, index, MaskKind::Visible)? {
             Some(mask) if image.visible_fractions()[index].is_some() => mask,
             _ => {
@@ -172,14 +184,14 @@ impl Reader<'_> {
                     }
                 };
                 let placed = [(&*mesh, truth.camera_from_object)];
-                let mut visible = ground_truth_visibility(&placed, &camera, Some(&depth), VISIBILITY_DELTA);
+                let mut visible = ground_truth_visibility(&placed, &camera, Some(depth), VISIBILITY_DELTA);
                 match visible.pop().filter(|v| v.info.visib_fract >= MIN_VISIBLE) {
                     Some(visible) => visible.mask_visible,
                     None => return Ok(None),
                 }
             }
         };
-        let depth = undistort_depth(&depth, &camera)?;
+        let depth = undistort_depth(depth, &camera)?;
         let camera = camera.without_distortion();
         // Only the part around the object is kept: a split may have thousands of images.
         let Some([left, top, width, height]) = mask.bounding_box() else { return Ok(None) };

@@ -134,6 +134,7 @@ fn templates_are_taken_from_the_depth_images_of_another_split() {
         annotated[im_id.to_string()][0]["cam_R_m2c"] = rows.into();
     }
     std::fs::write(&truth, annotated.to_string()).unwrap();
+    fails(dir, &format!("{images} --out images.csv"), &["set of given templates of object 1", "images.csv"]);
     sixfold(dir, &format!("{images} --ids 1 --out rotated.csv")).expect(0);
     let found = read_results(&dir.join("rotated.csv")).unwrap();
     assert_eq!(found.len(), 3);

@@ -92,7 +92,7 @@ const fn way(key: &'static str, title: &'static str, by: MatchedBy) -> Way {
 }
 
 /// Variants of template matching, the default first.
-const WAYS: [Way; 13] = [
+const WAYS: [Way; 14] = [
     way("both", "points and network, aligned, verified with the mesh (default)", MatchedBy::Both),
     Way {
         predicted_pose: false,
@@ -148,6 +148,12 @@ const WAYS: [Way; 13] = [
             "as published: the network alone, its masks before any alignment (comparable with table 5.1)",
             MatchedBy::Network,
         )
+    },
+    Way {
+        occluders_have_edges: false,
+        published: true,
+        predicted_pose: false,
+        ..way("published-template-pose", "the same without the predicted rotation", MatchedBy::Network)
     },
     way("points", "points alone (no network), aligned, verified with the mesh", MatchedBy::Points),
     Way {

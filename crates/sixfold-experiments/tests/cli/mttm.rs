@@ -18,13 +18,14 @@ fn a_reproduction_resumes() {
         "network-masks",
         "network-masks-verified",
         "published",
+        "published-template-pose",
         "points",
         "points-nearest",
         "ppf",
     ] {
         assert!(keys.contains(&key), "{key} of {keys:?}");
     }
-    assert_eq!((keys.len(), keys[0]), (14, "both"));
+    assert_eq!((keys.len(), keys[0]), (15, "both"));
     assert!(whole["rows"][0]["all"]["add_s"].as_f64().unwrap() > 0.6, "{whole}");
     assert!(whole["rows"][0]["all"]["iou"].as_f64().unwrap() > 0.6, "{whole}");
     let table = std::fs::read_to_string(dir.join("reproduced/table.md")).unwrap();
