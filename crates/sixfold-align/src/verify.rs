@@ -1,5 +1,5 @@
 //! The final verification of every method on depth: ICP of the rendered mesh against the depth image, then the scores of
-//! [`crate::verification`].
+//! [`crate::verification`] (dissertation, sections 5.2.5 and 5.3.3).
 
 use rayon::prelude::*;
 use sixfold_geometry::{DepthTarget, IcpLevel, IcpOptions, PointCloud, Pose, icp};

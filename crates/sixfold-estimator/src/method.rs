@@ -82,9 +82,9 @@ pub trait PoseEstimator: Send + Sync {
         true
     }
 
-    /// A hash of what the method holds of the object with this id that is neither in the object's files nor among the method's
-    /// options, such as templates from other images. A run that is resumed compares it. `None`: nothing.
-    fn held(&self, _id: u32) -> Option<u64> {
+    /// What the method holds of the object with this id that is neither in the object's files nor among the method's options, such
+    /// as templates from other images: its name, and a hash that a resumed run compares. `None`: nothing.
+    fn held(&self, _id: u32) -> Option<(&'static str, u64)> {
         None
     }
 

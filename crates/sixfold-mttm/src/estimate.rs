@@ -634,6 +634,58 @@ fn verify_all(
 mod tests {
     use super::*;
     use crate::template::TemplateOptions;
+    use sixfold_align::{DepthOptions, PreparedDepth};
+    use sixfold_geometry::{Camera, DepthImage};
+
+    /// A box from `low` to `high`, metres.
+    fn cuboid(low: [f64; 3], high: [f64; 3]) -> Mesh {
+        let corner =
+            |i: usize| Vec3::from_fn(|axis, _| if i >> axis & 1 == 1 { high[axis] } else { low[axis] });
+        let sides = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]];
+        let triangles = sides.iter().flat_map(|&[a, b, c, d]| [[a, b, c], [a, c, d]]).collect();
+        Mesh::new((0..8).map(corner).collect(), triangles).unwrap()
+    }
+
+    /// Section 5.3.3: S_final of the rendered mesh decides which hypotheses are refined. In our form it is the support.
+    #[test]
+    fn as_published_the_score_of_the_mesh_chooses_the_hypotheses() {
+        let mesh = Mesh::merged(&[
+            cuboid([-0.05, -0.04, 0.0], [0.05, 0.04, 0.03]),
+            cuboid([-0.05, -0.04, 0.03], [-0.01, 0.0, 0.09]),
+        ])
+        .unwrap();
+        let templates = ObjectTemplates::from_mesh(&mesh, &TemplateOptions::default()).unwrap();
+        let object = KnownObject::new(templates, Some(mesh.clone()));
+        // A view in which three sides are visible, so that alignment determines the position.
+        let shows_three = |t: &crate::template::Template| {
+            let along = t.view_from_object.rotation().inverse() * Vec3::z();
+            along.iter().all(|a| a.abs() > 0.4)
+        };
+        let oblique = object.templates.templates.iter().position(shows_three).unwrap();
+        let at = |x: f64| Placed {
+            template: oblique,
+            camera_from_view: Pose::from_translation(Vec3::new(x, 0.0, 0.7)),
+            score: VerificationScore::default(),
+            support: 0.9,
+            mask: None,
+        };
+        let truth = object.object_pose(&at(0.0).camera_from_view, oblique);
+        let camera = Camera::new(500.0, 500.0, 159.5, 119.5, 320, 240).unwrap();
+        let rendered = sixfold_render::render_depth(&mesh, &truth, &camera);
+        let of_wall = |z: f32| if z > 0.0 { z } else { 0.9 };
+        let depth = DepthImage::from_fn(320, 240, |x, y| of_wall(rendered[(x, y)]));
+        let options = DepthOptions { remove_plane: false, ..DepthOptions::default() };
+        let scene = DepthRegion::whole(&PreparedDepth::new(&depth, &camera, &options).unwrap());
+        // Twenty beside the object, and the least supported one 4 mm from it.
+        let mut hypotheses = vec![at(0.12); 20];
+        hypotheses.push(Placed { support: 0.1, ..at(0.004) });
+        let off = |options: MttmOptions| {
+            let found = verify_all(&scene, &object, &hypotheses, &MttmOptions { min_score: 0.0, ..options });
+            found.first().map_or(f64::INFINITY, |e| e.camera_from_object.distance_to(&truth))
+        };
+        let (published, ours) = (off(MttmOptions::published()), off(MttmOptions::default()));
+        assert!(published < 1e-3 && ours > 0.05, "{published} {ours}");
+    }
 
     #[test]
     fn templates_from_all_sides_get_more_hypotheses() {

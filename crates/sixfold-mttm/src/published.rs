@@ -14,6 +14,7 @@ use sixfold_align::DepthRegion;
 use sixfold_geometry::{Pose, Vec2, Vec3};
 
 use crate::align::align_shortly;
+use crate::by_network::encode;
 use crate::estimate::{KnownObject, MttmOptions, Placed, Stages, place_at};
 use crate::judge::judge;
 use crate::learned::Learned;
@@ -21,7 +22,6 @@ use crate::mask::{Pixels, common, template_mask};
 use crate::matching::Entry;
 use crate::model::{Encoded, PairOutput};
 use crate::network::MAP;
-use crate::patch::Patch;
 use crate::regions::RegionCache;
 use crate::roi::{Roi, UNKNOWN, ray_rotation};
 use crate::segmentation::nearest_entries;
@@ -73,13 +73,13 @@ pub(crate) fn hypotheses(
         .into_iter()
         .filter_map(|(_, mask)| Some((Roi { centre: centroid(scene, &mask)? }, mask)))
         .collect();
-    let accepted: Vec<Region> = centred
+    let accepted: Vec<(f64, Region)> = centred
         .par_iter()
         .filter_map(|(roi, mask)| Region::new(scene, object, learned, roi, mask, options))
         .collect();
     let accepted = most_inliers(accepted, options.masked);
     stages.regions = accepted.len();
-    accepted.par_iter().map(|r| r.placed(scene, object, options)).collect::<Vec<_>>().concat()
+    accepted.par_iter().map(|r| r.placed(scene, object, learned, options)).collect::<Vec<_>>().concat()
 }
 
 /// The masks that are large enough, without those that overlap an earlier one.
@@ -94,11 +94,11 @@ fn merged(masks: Vec<(Roi, Pixels)>) -> Vec<(Roi, Pixels)> {
     kept
 }
 
-/// At most `most` regions, those with the largest portion of inliers first; of equal ones the earlier is first.
-fn most_inliers(mut regions: Vec<Region>, most: usize) -> Vec<Region> {
-    regions.sort_by(|a, b| b.inliers.total_cmp(&a.inliers));
+/// At most `most` regions, given with their portions of inliers: those with the largest first, of equal ones the earlier first.
+fn most_inliers<T>(mut regions: Vec<(f64, T)>, most: usize) -> Vec<T> {
+    regions.sort_by(|a, b| b.0.total_cmp(&a.0));
     regions.truncate(most);
-    regions
+    regions.into_iter().map(|(_, region)| region).collect()
 }
 
 /// Whether the intersection of two masks exceeds a fraction of the smaller one.
@@ -107,18 +107,23 @@ pub(crate) fn overlaps(a: &Pixels, b: &Pixels, fraction: f64) -> bool {
 }
 
 /// A region that was not rejected.
-#[derive(Debug, Clone)]
+#[derive(Debug)]
 struct Region {
+    roi: Roi,
+    encoded: Encoded,
     /// The object's pixels, predicted for the first hypothesis.
     mask: Arc<Pixels>,
-    /// Templates and the poses that the network predicts for them.
-    hypotheses: Vec<(Entry, Pose)>,
-    /// Inliers among the points of the first hypothesis' template after three iterations of ICP, as a fraction.
-    inliers: f64,
+    /// Their centroid, camera frame.
+    centre: Vec3,
+    /// The nearest templates.
+    entries: Vec<Entry>,
+    /// The pose that the network predicts for the first of them.
+    first: Pose,
 }
 
 impl Region {
-    /// The second matching of one region; `None` if its first hypothesis does not cover its mask.
+    /// The second matching of one region, with the portion of inliers of its first hypothesis; `None` if that does not cover its
+    /// mask.
     fn new(
         scene: &DepthRegion,
         object: &KnownObject,
@@ -126,36 +131,49 @@ impl Region {
         roi: &Roi,
         first_mask: &Pixels,
         options: &MttmOptions,
-    ) -> Option<Region> {
+    ) -> Option<(f64, Region)> {
         let (model, size) = (learned.model(), learned.size());
-        let patch = Patch::of_scene(scene, roi, size, model.side(), |_| true);
-        let encoded = model.encode(&[&patch]);
+        let encoded = encode(scene, learned, &[*roi]);
         let bare = model.without_background(&encoded, cells_of(scene, roi, size, first_mask));
         let descriptor = model.describe(&bare).into_iter().next()?;
         let camera_from_roi = roi.camera_from_roi();
         let entries = nearest_entries(object, learned, &camera_from_roi, &descriptor, options.hypotheses);
-        let first = entries.first()?;
-        let regions = Encoded::joined(&vec![encoded; entries.len()]);
-        let output = model.compare(&regions, &learned.templates(&entries));
-        // One mask per region, predicted for its first hypothesis.
-        let mask = mask_pixels(scene, roi, size, &output[0].mask, 1);
+        let nearest = entries.first()?;
+        // The other templates are compared only if the region remains.
+        let output = model.compare(&encoded, &learned.templates(&entries[..1])).into_iter().next()?;
+        let mask = mask_pixels(scene, roi, size, &output.mask, 1);
         let centre = centroid(scene, &mask)?;
-        let poses: Vec<Pose> = entries
-            .iter()
-            .zip(&output)
-            .map(|(entry, output)| start(object, &camera_from_roi, &centre, entry, output, options))
-            .collect();
-        let inliers = inliers(scene, object, first, &poses[0], &mask, options)?;
-        Some(Region { mask: Arc::new(mask), hypotheses: entries.into_iter().zip(poses).collect(), inliers })
+        let first = start(object, &camera_from_roi, &centre, nearest, &output, options);
+        let inliers = inliers(scene, object, nearest, &first, &mask, options)?;
+        Some((inliers, Region { roi: *roi, encoded, mask: Arc::new(mask), centre, entries, first }))
     }
 
     /// Its hypotheses, aligned with the scene.
-    fn placed(&self, scene: &DepthRegion, object: &KnownObject, options: &MttmOptions) -> Vec<Placed> {
-        let place = |(entry, pose): &(Entry, Pose)| Placed {
+    fn placed(
+        &self,
+        scene: &DepthRegion,
+        object: &KnownObject,
+        learned: &Learned,
+        options: &MttmOptions,
+    ) -> Vec<Placed> {
+        let mut poses = vec![self.first];
+        let others = &self.entries[1..];
+        if !others.is_empty() {
+            let regions = Encoded::joined(&vec![self.encoded.clone(); others.len()]);
+            let output = learned.model().compare(&regions, &learned.templates(others));
+            let camera_from_roi = self.roi.camera_from_roi();
+            poses.extend(
+                others
+                    .iter()
+                    .zip(&output)
+                    .map(|(e, o)| start(object, &camera_from_roi, &self.centre, e, o, options)),
+            );
+        }
+        let place = |(entry, pose): (&Entry, Pose)| Placed {
             mask: Some(self.mask.clone()),
-            ..place_at(scene, object, entry.template, *pose, 1.0, options)
+            ..place_at(scene, object, entry.template, pose, 1.0, options)
         };
-        self.hypotheses.iter().map(place).collect()
+        self.entries.iter().zip(poses).map(place).collect()
     }
 }
 
@@ -354,12 +372,9 @@ mod tests {
 
     #[test]
     fn regions_with_the_largest_portion_of_inliers_remain() {
-        let region =
-            |inliers: f64, pixel: u32| Region { mask: Arc::new(vec![pixel]), hypotheses: vec![], inliers };
-        let regions = vec![region(0.3, 1), region(0.8, 2), region(0.1, 3), region(0.8, 4)];
-        let pixels = |most| most_inliers(regions.clone(), most).iter().map(|r| r.mask[0]).collect::<Vec<_>>();
-        assert_eq!(pixels(3), [2, 4, 1]);
-        assert_eq!(pixels(50), [2, 4, 1, 3]);
+        let regions = vec![(0.3, 1), (0.8, 2), (0.1, 3), (0.8, 4)];
+        assert_eq!(most_inliers(regions.clone(), 3), [2, 4, 1]);
+        assert_eq!(most_inliers(regions, 50), [2, 4, 1, 3]);
     }
 
     #[test]

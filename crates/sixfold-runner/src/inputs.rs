@@ -28,15 +28,15 @@ impl Inputs {
         dataset: &BopDataset,
         id: u32,
         infos: Option<&ModelsInfo>,
-        held: Option<u64>,
+        held: Option<(&'static str, u64)>,
     ) -> Inputs {
         let mut inputs = Inputs::default();
         let model = dataset.model_path(id, Models::Rendering);
         let info = model.with_file_name("models_info.json");
         inputs.file("mesh", Some(model));
         inputs.value("models_info", &infos.and_then(|i| i.0.get(&id)), info);
-        if held.is_some() {
-            inputs.value("set of given templates", &held, dataset.root().to_owned());
+        if let Some((name, hash)) = held {
+            inputs.0.insert(name, (hex(hash), dataset.root().to_owned()));
         }
         inputs
     }

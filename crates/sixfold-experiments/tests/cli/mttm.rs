@@ -30,6 +30,19 @@ fn a_reproduction_resumes() {
     assert!(whole["rows"][0]["all"]["iou"].as_f64().unwrap() > 0.6, "{whole}");
     let table = std::fs::read_to_string(dir.join("reproduced/table.md")).unwrap();
     assert!(table.contains("point pair features"), "{table}");
+    // Without the predicted rotation alignment starts elsewhere, and ends at least a little elsewhere.
+    let outcomes = |key: &str| {
+        let files = std::fs::read_dir(dir.join("reproduced/images")).unwrap();
+        let of_image = files.map(|file| {
+            let text = std::fs::read(file.unwrap().path()).unwrap();
+            let image: serde_json::Value = serde_json::from_slice(&text).unwrap();
+            image[key].as_array().unwrap().iter().map(|o| o["error"].clone()).collect::<Vec<_>>()
+        });
+        of_image.collect::<Vec<_>>().concat()
+    };
+    let [published, template_pose] = ["published", "published-template-pose"].map(outcomes);
+    assert_eq!(published.len(), template_pose.len());
+    assert_ne!(published, template_pose);
     // Stored images are not measured again, so the second run gives the same times, except for the last digit, which may change
     // when numbers are read as text.
     let mut again = sixfold(dir, reproduce).expect(0).json();
